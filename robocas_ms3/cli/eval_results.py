@@ -166,7 +166,7 @@ def table(cfg: WriteTable) -> int:
     ]
     if cfg.update and cfg.out.exists():
         earlier = read_leaderboard(cfg.out).rows
-        if any(row.audited for row in earlier):
+        if any(row.entry for row in earlier):
             what, fix = (
                 "this leaderboard has only audited results",
                 "Choose another file, or use robocas leaderboard add.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from robocas_ms3.cli.eval_audit import ReplayOptions, replay_result
 from robocas_ms3.cli.eval_results import Results
 from robocas_ms3.cli.options import Folders, Maybe, resumable
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
-    from robocas_ms3.evaluation.audit.run import AuditPlan
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
 
 
@@ -39,7 +38,7 @@ class Add(Results):
 
 
 @dataclass
-class AuditEntries:
+class AuditEntries(ReplayOptions):
     """Check entries, and replay their stored actions (exit status 1 if an outcome differs).
 
     Example: robocas leaderboard audit leaderboard/mine --sample 5
@@ -47,16 +46,10 @@ class AuditEntries:
 
     entries: Folders
     """Folders of entries, or of results in entries."""
-    sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Replay N episodes per result, chosen at random. Default: all with stored actions."""
-    seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Random seed of --sample. Default: a number that nobody can predict; it is printed."""
-    envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Number of environments that run at the same time. Default: one per CPU core."""
 
 
 @dataclass
-class Build:
+class Build(ReplayOptions):
     """Check and replay all entries, and write the leaderboard: index.html, results.md and results.json.
 
     The stored actions are replayed as in `robocas leaderboard audit`. The cache folder keeps the outcomes. Nothing is
@@ -69,14 +62,8 @@ class Build:
     """Folder with the entries."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Output folder."""
-    sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Replay N episodes per result, chosen at random. Default: all with stored actions."""
-    seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Random seed of --sample. Default: a number that nobody can predict; it is printed."""
     videos: int = 0
     """Number of videos of failed episodes per result, made from the stored actions."""
-    envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Number of environments that run at the same time. Default: one per CPU core."""
 
 
 def add(cfg: Add) -> int:
@@ -97,10 +84,10 @@ def audit(cfg: AuditEntries) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.leaderboard.entries import find_results
 
-    _check_numbers(cfg)
+    cfg.check()
     folders = list(dict.fromkeys(folder for entry in cfg.entries for folder in find_results(entry)))
-    with tempfile.TemporaryDirectory() as memory:
-        audited = [_audit_result(folder, Path(memory), cfg) for folder in folders]
+    with tempfile.TemporaryDirectory() as cache:
+        audited = [_audit_result(folder, Path(cache), cfg) for folder in folders]
     bad = audited.count(None)
     print_line(f"{format_count(len(folders), 'result')} checked, {bad} with problems")
     return 1 if bad else 0
@@ -114,7 +101,7 @@ def build(cfg: Build) -> int:
     from robocas_ms3.evaluation.leaderboard.entries import find_results
     from robocas_ms3.evaluation.leaderboard.output import write_leaderboard_page
 
-    _check_numbers(cfg)
+    cfg.check()
     check_number("--videos", cfg.videos, 0)
     audited = [_audit_result(folder, cache_dir() / "audits", cfg) for folder in find_results(cfg.entries)]
     results = [one for one in audited if one is not None]
@@ -129,62 +116,41 @@ def build(cfg: Build) -> int:
     return 0
 
 
-def _check_numbers(cfg: AuditEntries | Build) -> None:
-    from robocas_ms3.core.checks import check_number
-
-    for name, least in (("sample", 1), ("envs", 1), ("seed", 0)):
-        if (number := getattr(cfg, name)) is not None:
-            check_number(f"--{name}", number, least)
-
-
-def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> AuditedResult | None:
+def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> AuditedResult | None:
     """Check a result, replay its stored actions and print its problems; None: it has problems.
 
-    An audit is kept in ``memory``, in a folder named by its hash, so that it is continued and not repeated.
+    An audit is stored in a subfolder of ``cache`` named by its hash, so that it is continued and not repeated.
     """
     from robocas_ms3.cli.eval_results import find_protocol_of
-    from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit, run_audit
+    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit
     from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
     from robocas_ms3.evaluation.results import read_result
 
-    result, count, from_checkpoints = read_result(folder), 0, 0
-    protocol = find_protocol_of(result, None)
-    problems = find_result_violations(result, protocol)
+    try:
+        result = read_result(folder)
+        protocol = find_protocol_of(result, None)
+        problems = find_result_violations(result, protocol)
+    except EvaluationError as error:
+        print_line(f"{folder}: {error}")
+        return None
     if not problems and (obstacle := find_audit_obstacle(result)):
         problems = [f"cannot be audited: {obstacle}"]
-    plans: list[AuditPlan] = []
-    if not problems:
-        with ProgressBar("episodes replayed") as bar:
-
-            def start(plan: AuditPlan) -> None:
-                plans.append(plan)
-                bar.start(len(plan.episodes))
-
-            for one in run_audit(
-                result,
-                protocol,
-                memory / hash_audit(result),
-                sample=cfg.sample,
-                seed=cfg.seed,
-                stored=list_stored_episodes(result, protocol),
-                envs=cfg.envs or len(os.sched_getaffinity(0)),
-                on_start=start,
-            ):
-                bar.advance()
-                count += 1
-                from_checkpoints += one.mode == "checkpoints"
-                problems += [f"episode {one.episode}, recorded -> replayed: {text}" for text in one.differences]
-    for problem in problems:
-        print_line(f"{folder}: {problem}")
     if problems:
+        for problem in problems:
+            print_line(f"{folder}: {problem}")
         return None
-    mode = f", {from_checkpoints} of them within tolerances from checkpoint to checkpoint" if from_checkpoints else ""
-    sample = "" if cfg.sample is None else f", sample with seed {plans[0].seed}"
-    print_line(f"{folder}: no differences in {format_count(count, 'episode')}{mode}{sample}")
-    return AuditedResult(result, protocol, count)
+    stored = list_stored_episodes(result, protocol)
+    summary = replay_result(result, protocol, cache / hash_audit(result), cfg, stored=stored)
+    if summary.differences:
+        return None
+    with_tolerances = list(summary.modes.values()).count("checkpoints")
+    mode = f", {with_tolerances} of them within tolerances from checkpoint to checkpoint" if with_tolerances else ""
+    sample = "" if cfg.sample is None else f", sample with seed {summary.plan.seed}"
+    print_line(f"{folder}: no differences in {format_count(len(summary.episodes), 'episode')}{mode}{sample}")
+    return AuditedResult(result, protocol, summary.modes)
 
 
 def _record_videos(audited: AuditedResult, cfg: Build) -> None:
@@ -206,10 +172,12 @@ def _record_videos(audited: AuditedResult, cfg: Build) -> None:
     ]
     if numbers:
         with ProgressBar("videos recorded") as bar:
-            for done, _ in enumerate(
-                record_videos(result, protocol, StoredActionsPolicy(result), numbers, folder), start=1
-            ):
-                bar.update(done, len(numbers))
+            bar.start(len(numbers))
+            for path, same in record_videos(result, protocol, StoredActionsPolicy(result), numbers, folder):
+                bar.advance()
+                if not same:  # contacts may diverge on another processor
+                    path.unlink()
+                    bar.add_note(f"no video of {result.folder}, {path.stem}: the outcome of the replay differs")
 
 
 COMMANDS = {"add": add, "audit": audit, "build": build}

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos.difficulty.difficulty_file import (
+    SCENES,
     DifficultySettings,
     SeedResult,
     measure_seeds,
@@ -80,10 +81,19 @@ def measure_protocol(
         settings[name] = DifficultySettings(config.task, content, protocol.rules.pack, limits, layouts)
         settings[name].check(where=f"configuration {name} of {protocol.rules.name}")
     scenes = {(episode.config, episode.seed) for episode in protocol.episodes}
+    if (out / DIFFICULTIES).exists() and not any((out / name / SCENES).exists() for name in seeds):
+        what, fix = "the output exists and was not written by robocas difficulty", "Choose another folder."
+        raise OutputExistsError(what, where=out / DIFFICULTIES, fix=fix)
     on_start(len(scenes), 0 if overwrite else len(read_measured(protocol, out)))
+
+    def delete_earlier(_: int) -> None:
+        (out / DIFFICULTIES).unlink(missing_ok=True)  # of other limits, or of fewer scenes
+
     for name, numbers in seeds.items():
         distinct = list(dict.fromkeys(numbers))
-        yield from measure_seeds(settings[name], distinct, out / name, jobs=jobs, overwrite=overwrite)
+        yield from measure_seeds(
+            settings[name], distinct, out / name, jobs=jobs, overwrite=overwrite, on_start=delete_earlier
+        )
     measured = read_measured(protocol, out)
     if len(measured) == len(scenes):
         lines = [measured[episode.config, episode.seed] for episode in protocol.episodes]

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection, Iterator
-from typing import get_args
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.strict_model import validate_json
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import MEASURES, Outcome, compute_order_score, find_failure_stage
-from robocas_ms3.evaluation.policy import Track
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, Protocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.run_record import RunRecord
@@ -31,6 +35,7 @@ _IMPLIED = (
 )
 _TIME_TOLERANCE = 1e-3  # s
 _HASH = re.compile("[0-9a-f]{64}")
+_SPEC = TypeAdapter(PolicySpec)
 
 
 def find_violations(
@@ -58,8 +63,8 @@ def find_violations(
         found.append("weld: true, but the weld needs a protocol with RoboCAS-v0's steps")
     if run.played_as != protocol.find_task_aliases(list(run.played_as)):
         found.append(f"played_as is {run.played_as}, but this protocol allows no such alias")
-    if run.policy.track not in get_args(Track):
-        found.append(f"policy.spec.track is {run.policy.track}, expected one of {', '.join(get_args(Track))}")
+    if problems := _find_spec_violations(run.policy.spec):  # the checks of the episodes need its rate
+        return found + problems
     for number, outcome in result.outcomes.items():
         if number < count:
             of_episode = [*_find_outcome_violations(outcome, protocol.episodes[number], protocol, run)]
@@ -74,6 +79,15 @@ def find_violations(
     if is_complete and missing:
         found.append(f"{missing} of {format_count(count, 'episode')} missing")
     return found
+
+
+def _find_spec_violations(spec: dict[str, Any]) -> list[str]:
+    try:
+        validate_json(_SPEC, json.dumps(spec))
+    except ValidationError as error:
+        problems = [(".".join(map(str, one["loc"])), one["input"], one["msg"]) for one in error.errors()]
+        return [f"policy.spec.{key} is {value}: {message}" for key, value, message in problems]
+    return []
 
 
 def _find_outcome_violations(
@@ -168,7 +182,11 @@ def _find_retrieval_violations(outcome: Outcome) -> Iterator[str]:
     order = outcome.retrieval
     if order is None:
         return
-    late = [move for move in order.moved if not 0 < move.step <= outcome.steps]
+    if "obstacles_cleared" not in outcome.flags:
+        yield "retrieval: unexpected; expected only in tasks with the stage obstacles_cleared"
+    for move in order.moved:
+        if not 0 < move.step <= outcome.steps:
+            yield f"retrieval: an object moved at step {move.step}, expected 1 to {outcome.steps}"
     score = compute_order_score(order.moved, order.left, outcome.flags.get("target_grasped"))
-    if "obstacles_cleared" not in outcome.flags or late or order.score != score:
-        yield "retrieval: the score does not fit the moved objects, or the steps do not fit the episode"
+    if order.score != score:
+        yield f"retrieval: the score is {order.score}, expected {score} from the moved objects"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.evaluation.clutter_scale.features import make_features
@@ -33,6 +33,16 @@ def test_scenes_are_measured_in_the_frozen_layouts(tmp_path):
         assert found == [pytest.approx(getattr(expected[number], name), abs=1e-3) for number in numbers], name
     assert list(measure_protocol(few, tmp_path, limits, on_start=lambda *start: counts.append(start))) == []
     assert counts == [(3, 0), (3, 3)]
+    more = replace(protocol, episodes=(*few.episodes, protocol.episodes[2]))
+    next(iter(measure_protocol(more, tmp_path, limits)))
+    assert not (tmp_path / DIFFICULTIES).exists(), "not all scenes are measured"
+
+
+def test_a_file_of_another_command_is_not_replaced(tmp_path):
+    (tmp_path / DIFFICULTIES).write_text("mine")
+    with pytest.raises(OutputExistsError):
+        next(iter(measure_protocol(load_protocol("clutter-scale-v1"), tmp_path, RemovalLimits(max_removals=0))))
+    assert (tmp_path / DIFFICULTIES).read_text() == "mine"
 
 
 def test_protocol_without_difficulties_is_an_error():

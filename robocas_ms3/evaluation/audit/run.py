@@ -67,12 +67,34 @@ class AuditPlan(NamedTuple):
     Attributes:
         episodes: numbers of the episodes.
         seed: random seed by which they were chosen.
-        replayed: number of these episodes that were replayed in an earlier run of the audit.
+        candidates: number of episodes from which they were chosen.
+        replayed_before: number of these episodes that were replayed in an earlier run of the audit.
     """
 
     episodes: list[int]
     seed: int
-    replayed: int
+    candidates: int
+    replayed_before: int
+
+
+@dataclass(frozen=True)
+class AuditSummary:
+    """Outcome of an audit: its plan, and the replayed episodes."""
+
+    plan: AuditPlan
+    episodes: list[AuditedEpisode]
+
+    @property
+    def differences(self) -> list[str]:
+        """Return a text per difference."""
+        return [
+            f"episode {one.episode}, recorded -> replayed: {text}" for one in self.episodes for text in one.differences
+        ]
+
+    @property
+    def modes(self) -> dict[int, Mode]:
+        """Return how each episode was replayed, by its number."""
+        return {one.episode: one.mode for one in self.episodes}
 
 
 def list_other_processors(result: Result) -> list[str]:
@@ -152,7 +174,8 @@ def run_audit(
         output.start({**settings, "seed": seed})
         file = JsonLinesFile[AuditedEpisode](output.path / _EPISODES, AuditedEpisode)
         replayed, chosen = {one.episode: one for one in file.read()}, choose_episodes(result, sample, seed, stored)
-        on_start(AuditPlan(chosen, seed, len(replayed.keys() & set(chosen))))
+        candidates = len(choose_episodes(result, None, seed, stored))
+        on_start(AuditPlan(chosen, seed, candidates, len(replayed.keys() & set(chosen))))
         yield from (replayed[number] for number in chosen if number in replayed)
         episodes = [protocol.episodes[number] for number in chosen if number not in replayed]
         for one in _replay(result, protocol, episodes, envs) if episodes else ():

@@ -136,14 +136,19 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
     are left out.
 
     Raises:
-        EvaluationError: a result has another protocol, the fixed scale is damaged or lacks the tasks of the results,
-            or no task has two policies between 10 and 90 %.
+        EvaluationError: a result has another protocol, two results have the same policy and noise, the fixed scale is
+            damaged or lacks the tasks of the results, or no task has two policies between 10 and 90 %.
     """
     for result in results:
         if result.run.protocol_hash != protocol.hash:
             found = f"{result.run.protocol}, hash {result.run.protocol_hash[:16]}"
             expected = f"{protocol.rules.name}, hash {protocol.hash[:16]}"
             raise EvaluationError("result of another protocol", where=result.folder, expected=expected, found=found)
+    folders: dict[str, Path] = {}
+    for result in results:
+        if (first := folders.setdefault(_name(result), result.folder)) != result.folder:
+            what, fix = "two results of the same policy", "Pass one of them."
+            raise EvaluationError(what, where=result.folder, expected=f"only {first}", found=_name(result), fix=fix)
     fixed = None if fit else read_scales(protocol.folder / SCALE_FILE)
     tasks: dict[str, TaskStudy] = {}
     left_out: dict[str, dict[str, float]] = {}
@@ -216,6 +221,9 @@ def _place_policies(
 def _read_successes(result: Result, count: int) -> NDArray[np.float64]:
     row = np.full(count, np.nan)
     for number, outcome in result.outcomes.items():
+        if number >= count:
+            what, expected = "an episode is not in the protocol", f"fewer than {count} episodes"
+            raise EvaluationError(what, where=result.folder, expected=expected, found=f"episode {number}")
         row[number] = outcome.success and not outcome.error
     return row
 

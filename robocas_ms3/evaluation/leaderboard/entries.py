@@ -19,6 +19,7 @@ from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.files import atomic_file, atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.text import format_count
+from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import RUN, Result, write_outcomes
 from robocas_ms3.evaluation.stored_episodes import write_actions, write_checkpoints
@@ -77,11 +78,20 @@ def find_card(folder: Path) -> Path:
     return folder.absolute().parent / CARD
 
 
+def get_entry_name(folder: Path) -> str:
+    """Return the name of the entry that contains the folder of a result."""
+    return folder.absolute().parent.name
+
+
 def find_result_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
     """Return one text per violation in a result of an entry (`find_violations`)."""
     found = find_violations(result, protocol, is_complete=False, stored=list_stored_episodes(result, protocol))
     if missing := count_missing(result, protocol):
         found.append(f"{format_count(missing, 'episode')} of its configurations missing")
+    try:
+        make_rows(result, protocol)
+    except EvaluationError as error:
+        found.append(str(error))
     if not find_card(result.folder).is_file():
         found.append(f"no model card {find_card(result.folder)}; write it, or pass --card to robocas leaderboard add")
     return found
@@ -100,8 +110,9 @@ def write_result(
         overwrite: whether to replace an existing result.
 
     Raises:
-        EvaluationError: the result has violations (`find_violations`), or lacks episodes of its configurations.
-        OutputExistsError: ``out`` exists, or the entry has another model card.
+        EvaluationError: the result has violations (`find_violations`), or lacks episodes of its configurations, or the
+            folder has not the name of the protocol.
+        OutputExistsError: ``out`` exists, or the entry has another model card, or another kind of folder has a README.
     """
     if violations := find_violations(result, protocol, is_complete=False):
         what, fix = "the result has violations", "Run robocas eval verify to list all."
@@ -111,11 +122,18 @@ def write_result(
         what, fix = "the result lacks episodes of its configurations", "Evaluate all episodes."
         found = f"{format_count(missing, 'episode')} missing"
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
+    if out.absolute().name != protocol.rules.name:
+        what, fix = "the folder of the result has another name than its protocol", "See robocas leaderboard add --help."
+        raise EvaluationError(what, where=out, expected=f"ENTRY/{protocol.rules.name}", fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
     text = None if card is None else _read_card(card)
-    if text is not None and not overwrite and find_card(out).exists() and _read_card(find_card(out)) != text:
-        fix = "Omit --card to keep it, or pass --overwrite."
-        raise OutputExistsError("the entry has another model card", where=find_card(out), fix=fix)
+    if text is not None and find_card(out).exists() and _read_card(find_card(out)) != text:
+        if not any(find_card(out).parent.glob(f"*/{RUN}")):
+            what, fix = "the README.md of a folder without results is not replaced", "Choose a new folder as ENTRY."
+            raise OutputExistsError(what, where=find_card(out), fix=fix)
+        if not overwrite:
+            fix = "Omit --card to keep it, or pass --overwrite."
+            raise OutputExistsError("the entry has another model card", where=find_card(out), fix=fix)
     sample = list_stored_episodes(result, protocol)
     # a path of the author's machine means nothing to others
     parts = [part.model_copy(update={"folder": Path(part.folder).name}) for part in result.run.merged_from]

@@ -23,10 +23,14 @@ NOTE = (
     "split and track, without notes."
 )
 RANK_NOTE = (
-    "Rank: 1 plus the number of policies of the same track, task and split with significantly more successes "
-    "(McNemar's exact test over the same episodes, adjusted by Holm's method), so that ties have equal ranks. Audited: "
-    "number of episodes whose stored actions were replayed without differences."
+    "Rank: 1 plus the number of policies of the same track, task, split and camera calibration with significantly "
+    "more successes (McNemar's exact test over the same episodes, adjusted by Holm's method), so that ties have equal "
+    "ranks. Rows with action noise or weld have no rank. Audited: number of episodes whose stored actions were "
+    "replayed without any difference; +N: N further episodes were replayed within tolerances, on another processor. "
+    "The other episodes have only a hash of their actions: their outcomes are claims of the author."
 )
+SUSPICIOUS = 0.001
+"""p-value below which a row notes that success differs between episodes with and without stored actions."""
 NOT_AUDITED_NOTE = (
     "These results are not audited: their actions were not replayed. robocas leaderboard build writes the leaderboard "
     "of audited results."
@@ -42,7 +46,7 @@ def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
     if any(row.rank is not None for row in rows):
         lines += ["", RANK_NOTE]
-    if any(not row.published and not row.audited for row in rows):
+    if any(not (row.published or row.audited or row.audited_with_tolerances) for row in rows):
         lines += ["", NOT_AUDITED_NOTE]
     for row in rows:
         if not row.published:
@@ -68,14 +72,14 @@ def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:
         if has_seen:
             cells.insert(_CHANGE_COLUMN, _format_change(row, find_seen_row(row, rows)))
         if has_ranks:
-            cells += ["" if row.rank is None else str(row.rank), str(row.audited)]
+            cells += ["" if row.rank is None else str(row.rank), format_audited(row)]
         yield f"| {' | '.join(map(escape_markdown, cells))} |"
 
 
 def _make_cells(row: LeaderboardRow) -> list[str]:
     training = row.training or Training()
     return [
-        *(row.policy, row.track, row.task, row.split),
+        *(row.name, row.track, row.task, row.split),
         "" if row.n is None else str(row.n),
         _format_success(row),
         _format_percent(row.rate_v0),
@@ -86,6 +90,11 @@ def _make_cells(row: LeaderboardRow) -> list[str]:
         "" if row.parameters is None else f"{row.parameters / 1e6:.2f} M",
         "; ".join(list_row_notes(row)),
     ]
+
+
+def format_audited(row: LeaderboardRow) -> str:
+    """Return the numbers of audited episodes: without differences, and within tolerances."""
+    return f"{row.audited} +{row.audited_with_tolerances}" if row.audited_with_tolerances else str(row.audited)
 
 
 def _format_success(row: LeaderboardRow) -> str:
@@ -127,6 +136,8 @@ def list_row_notes(row: LeaderboardRow) -> Iterator[str]:
         yield f"{row.n} of {format_count(row.n_protocol, 'episode')}"
     if row.errors:
         yield f"{format_count(row.errors, 'episode')} ended by an error"
+    if row.sample_p_value is not None and row.sample_p_value < SUSPICIOUS:
+        yield f"success differs between episodes with and without stored actions (p = {row.sample_p_value:.1g})"
     if row.calibration == "true":
         yield "true camera calibration"
     yield from row.differences

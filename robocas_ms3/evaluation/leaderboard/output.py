@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from scipy.stats import fisher_exact
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.core.text import escape_controls
+from robocas_ms3.evaluation.audit.run import Mode
+from robocas_ms3.evaluation.leaderboard.entries import get_entry_name, list_stored_episodes
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.page import render_leaderboard_page
 from robocas_ms3.evaluation.leaderboard.ranks import rank_policies
@@ -32,12 +36,12 @@ class AuditedResult(NamedTuple):
     Attributes:
         result: the result.
         protocol: its protocol.
-        audited: number of episodes that were replayed.
+        modes: how each replayed episode was replayed, by its number.
     """
 
     result: Result
     protocol: LoadedProtocol
-    audited: int
+    modes: dict[int, Mode]
 
 
 def write_leaderboard_page(results: Sequence[AuditedResult], out: Path) -> list[Path]:
@@ -64,30 +68,54 @@ def write_leaderboard_page(results: Sequence[AuditedResult], out: Path) -> list[
 def rank_rows(results: Sequence[AuditedResult]) -> list[LeaderboardRow]:
     """Return one row per task and split of each result, with its rank among comparable rows (`rank_policies`).
 
-    Rows are comparable if they have the same protocol, task, split, track, calibration and conditions.
+    Rows are comparable if they have the same protocol, task, split, track and calibration, and no differences.
     """
     groups: dict[tuple, list[tuple[LeaderboardRow, dict[int, bool]]]] = {}
     folders: dict[tuple, Path] = {}
     for one in results:
+        entry = get_entry_name(one.result.folder)
         for row in make_rows(one.result, one.protocol):
-            same = row.policy, row.weights, row.protocol_hash, row.task, row.split, row.calibration, *row.differences
+            conditions = row.protocol_hash, row.task, row.split, row.calibration, tuple(row.differences)
+            same = (row.weights or entry, *conditions)
             if (first := folders.setdefault(same, one.result.folder)) != one.result.folder:
                 what, expected = "two results of the same policy, protocol, task and split", "one result"
                 raise EvaluationError(what, where=one.result.folder, expected=expected, found=str(first))
-            outcomes = [
-                outcome
+            outcomes = {
+                outcome.episode: outcome
                 for outcome in one.result.outcomes.values()
                 if (outcome.task, outcome.split) == (row.task, row.split)
-            ]
-            key = row.protocol_hash, row.task, row.split, row.track, row.calibration, tuple(row.differences)
-            successes = {outcome.episode: outcome.success for outcome in outcomes}
-            groups.setdefault(key, []).append((row.model_copy(update={"audited": one.audited}), successes))
+            }
+            successes = {number: outcome.success for number, outcome in outcomes.items()}
+            audited = row.model_copy(update={"entry": entry, **_describe_audit(one, successes)})
+            groups.setdefault((row.track, *conditions), []).append((audited, successes))
     ranked = []
     for group in groups.values():
-        group.sort(key=lambda pair: -(pair[0].rate or 0.0))
+        rows = sort_rows(row for row, _ in group)
+        group.sort(key=lambda pair: rows.index(pair[0]))
+        if rows[0].differences:
+            ranked += rows
+            continue
         ranks = rank_policies([successes for _, successes in group])
         ranked += [
             row.model_copy(update={"rank": rank.rank, "rank_p_value": rank.p_value})
-            for (row, _), rank in zip(group, ranks, strict=True)
+            for row, rank in zip(rows, ranks, strict=True)
         ]
     return ranked
+
+
+def _describe_audit(audited: AuditedResult, successes: Mapping[int, bool]) -> dict[str, Any]:
+    """Return the fields of a row about the audit of its episodes; ``successes``: success by number of the episode."""
+    stored = set(list_stored_episodes(audited.result, audited.protocol))
+    inside = [success for number, success in successes.items() if number in stored]
+    outside = [success for number, success in successes.items() if number not in stored]
+    p_value = None
+    if inside and outside:
+        counts = [[sum(some), len(some) - sum(some)] for some in (inside, outside)]
+        p_value = float(fisher_exact(counts).pvalue)
+    modes = [mode for number, mode in audited.modes.items() if number in successes]
+    tolerances = modes.count("checkpoints")
+    return {
+        "audited": len(modes) - tolerances,
+        "audited_with_tolerances": tolerances,
+        "sample_p_value": p_value,
+    }

@@ -6,30 +6,31 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from robocas_ms3.evaluation.leaderboard.entries import find_card
+from robocas_ms3.evaluation.audit.run import hash_result
+from robocas_ms3.evaluation.leaderboard.entries import find_card, get_entry_name
 from robocas_ms3.evaluation.leaderboard.markdown import (
     PUBLISHED_NOTE,
     RANK_NOTE,
     describe_cost,
     describe_data,
+    format_audited,
     list_row_notes,
 )
 from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow, Training
 from robocas_ms3.evaluation.report.html import render_document, render_rate_bar, render_section, render_table
 from robocas_ms3.evaluation.report.page import VIDEOS, render_stages
-from robocas_ms3.evaluation.report.tables import name_policy
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import compute_success_rate
 
 NOTE = (
-    f"Success rates with exact 95 % intervals. {RANK_NOTE} p: adjusted p-value of the comparison with the next policy "
-    "of the track. An audit shows that the stored actions have these outcomes, but not which policy chose them."
+    f"Success rates with exact 95 % intervals. {RANK_NOTE} p: adjusted p-value of the comparison with the next ranked "
+    "policy. An audit shows that the stored actions have these outcomes, but not which policy chose them."
 )
 _HEADS = (
-    *("protocol", "task", "split", "track", "rank#", "policy", "success#", "0 to 100 %", "n#", "p#", "audited#"),
+    *("protocol", "task", "split", "track", "rank#", "policy", "success#", "0 to 100 %", "n#", "p#", "audited"),
     *("trained here", "training data", "training", "parameters#", "notes"),
 )
-_FILTERS = ("protocol", "task", "split", "track", "policy", "trained here")
+_FILTERS = ("protocol", "task", "split", "track", "policy", "trained here", "training data")
 
 
 def render_leaderboard_page(rows: Sequence[LeaderboardRow], results: Sequence[Result], folder: Path) -> str:
@@ -55,8 +56,9 @@ def render_leaderboard_page(rows: Sequence[LeaderboardRow], results: Sequence[Re
 
 
 def video_folder(folder: Path, result: Result) -> Path:
-    """Return the folder of the videos of a result, next to the page in ``folder``."""
-    return folder / VIDEOS / result.folder.parent.name / result.folder.name  # names of files, not of the result
+    """Return the folder of the videos of a result, next to the page in ``folder``; each result has its own."""
+    names = get_entry_name(result.folder), result.folder.name, hash_result(result)[:8]  # no names from the result
+    return folder.joinpath(VIDEOS, *names)
 
 
 def _render_filters(rows: Sequence[Sequence[str]]) -> str:
@@ -74,12 +76,12 @@ def _render_row(row: LeaderboardRow) -> list[str]:
     return [
         *map(escape, (row.protocol, row.task, row.split, row.track)),
         "" if row.rank is None else str(row.rank),
-        escape(row.policy),
+        escape(row.name),
         f"{100 * rate.rate:.1f} %<small>{100 * rate.low:.1f} to {100 * rate.high:.1f}</small>",
         render_rate_bar(rate, "good"),
         str(rate.n),
         "" if row.rank_p_value is None else f"{row.rank_p_value:.2g}",
-        str(row.audited),
+        format_audited(row),
         "" if row.trained_here is None else "yes" if row.trained_here else "no",
         escape(describe_data(training)),
         escape(describe_cost(training)),
@@ -90,7 +92,7 @@ def _render_row(row: LeaderboardRow) -> list[str]:
 
 def _render_result(result: Result, folder: Path) -> str:
     """Return the stages of a result, links to its videos and the model card, folded."""
-    policy, protocol = name_policy(result.run), result.run.protocol
+    policy, protocol = get_entry_name(result.folder), result.run.protocol
     videos = sorted(video_folder(folder, result).glob("*.mp4"))
     links = " ".join(f'<a href="{escape(one.relative_to(folder).as_posix())}">{one.stem}</a>' for one in videos)
     shown = f"<p>Videos of failed episodes: {links}</p>\n" if videos else ""

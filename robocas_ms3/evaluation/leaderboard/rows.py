@@ -48,6 +48,7 @@ class LeaderboardRow(StrictModel):
 
     Attributes:
         policy: name of the policy; for a run folder, the name of its baseline.
+        entry: name of the entry of the leaderboard; empty: not in a leaderboard.
         track: track of the policy (`PolicySpec.track`).
         published: whether the row was copied from a publication; False: measured with this package.
         protocol, protocol_hash: name and hash of the protocol; no hash for published rows.
@@ -65,7 +66,11 @@ class LeaderboardRow(StrictModel):
         calibration: camera calibration that the policy observes; None: no cameras, or unknown.
         differences: conditions that make the rates not comparable with rows of the same protocol without them.
         weights: hash of the weights; empty: unknown.
-        audited: number of episodes of the result whose stored actions were replayed without differences.
+        audited: number of episodes whose stored actions were replayed without any difference.
+        audited_with_tolerances: number of episodes that were replayed from checkpoint to checkpoint, without
+            differences beyond the tolerances.
+        sample_p_value: p-value of Fisher's exact test of the success rates of the episodes with and without stored
+            actions; None: all or none have stored actions.
         rank: 1 plus the number of comparable policies that are significantly better; None: not ranked.
         rank_p_value: adjusted p-value of the comparison with the next policy; None: not compared (`ranks.Rank`).
         backend, versions: backend and package versions of the evaluation.
@@ -73,6 +78,7 @@ class LeaderboardRow(StrictModel):
     """
 
     policy: str
+    entry: str = ""
     track: Track
     published: bool = False
     protocol: str
@@ -94,6 +100,8 @@ class LeaderboardRow(StrictModel):
     differences: list[str] = []
     weights: str = ""
     audited: Count = 0
+    audited_with_tolerances: Count = 0
+    sample_p_value: Rate | None = None
     rank: Annotated[int, Field(ge=1)] | None = None
     rank_p_value: Rate | None = None
     backend: str = ""
@@ -111,6 +119,11 @@ class LeaderboardRow(StrictModel):
             if abs(self.rate - self.successes / self.n) > 1e-4:
                 raise ValueError(f"rate: expected {self.successes / self.n:.4f} = successes / n, found {self.rate:g}")
         return self
+
+    @property
+    def name(self) -> str:
+        """Return the name to show: that of the entry, with that of the policy if it differs."""
+        return self.policy if self.entry in ("", self.policy) else f"{self.entry} ({self.policy})"
 
 
 class Leaderboard(StrictModel):
@@ -131,7 +144,7 @@ def sort_rows(rows: Iterable[LeaderboardRow]) -> list[LeaderboardRow]:
 
     def key(row: LeaderboardRow) -> tuple:
         rate = row.rate_v0 if row.rate is None else row.rate
-        return row.published, row.protocol, row.task, row.split, tracks.index(row.track), -(rate or 0.0), row.policy
+        return row.published, row.protocol, row.task, row.split, tracks.index(row.track), -(rate or 0.0), row.name
 
     return sorted(rows, key=key)
 

@@ -90,7 +90,7 @@ def test_a_true_result_has_no_differences_and_an_audit_is_continued(folder, made
     assert seeds[4:] == [one.seed for one in SMOKE.episodes[:4]]
     plans = []
     assert replay(folder, on_start=plans.append) == ([0, 1, 2, 3], [])
-    assert plans[0].replayed == 4
+    assert plans[0].replayed_before == 4
     assert sum(len(env.seeds) for env in made) == 8  # nothing was replayed
 
 
@@ -197,7 +197,7 @@ def test_a_sample_is_repeatable_and_leaves_out_episodes_with_errors(folder):
     assert replay(folder, "drawn", sample=2) == drawn  # an audit that is continued keeps its sample
 
 
-def test_episodes_with_errors_are_replayed_up_to_the_error(folder):
+def test_episodes_with_errors_are_replayed_up_to_the_error(folder, tmp_path, capsys):
     lost = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "error"}
     one = read_result(folder).outcomes[0]
     flags, seconds = {**one.flags, "success": None}, {**one.flag_seconds, "success": None}
@@ -222,6 +222,10 @@ def test_episodes_with_errors_are_replayed_up_to_the_error(folder):
     none = {"flags": dict.fromkeys(flags), "flag_seconds": dict.fromkeys(flags), "steps": 0, "seconds": 0.0}
     forge(folder, 0, np.zeros((0, 7)), **lost, error="the worker process crashed", **none)
     assert choose_episodes(read_result(folder), None, 0) == [1, 2, 3]
+    assert audit(Audit(folder, out=tmp_path / "complete", envs=1)) == 0
+    printed = capsys.readouterr().out
+    assert "1 episode failed before the first action" in printed
+    assert "sample with seed" not in printed
 
 
 def test_the_sample_of_an_entry_is_replayed(folder, card, tmp_path, monkeypatch, capsys):
@@ -251,7 +255,7 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
     build = leaderboard.Build(tmp_path / "entries", out, envs=1)
     assert leaderboard.build(build) == 0
     rows = [row for row in read_leaderboard(out / "results.json").rows if not row.published]
-    assert {(row.task, row.n, row.audited) for row in rows} == {("pick", 2, 4), ("select", 2, 4)}
+    assert {(row.task, row.n, row.audited) for row in rows} == {("pick", 2, 2), ("select", 2, 2)}
     with monkeypatch.context() as patch:  # the replays are remembered
         patch.setattr(session, "make_vec", lambda *args, **kwargs: pytest.fail("an episode was replayed again"))
         assert leaderboard.build(build) == 0
@@ -266,6 +270,8 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
 
 def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    record = json.loads((folder / RUN).read_text())
+    (folder / RUN).write_text(json.dumps(record | {"policy": record["policy"] | {"weights": "ab" * 32}}))
     for name in ("mine", "again"):
         leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / name / "smoke"))
     with pytest.raises(EvaluationError, match="two results of the same policy"):

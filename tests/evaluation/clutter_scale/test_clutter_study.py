@@ -17,7 +17,7 @@ from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
 from robocas_ms3.evaluation.clutter_scale.study import make_study
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import read_result
+from robocas_ms3.evaluation.results import OUTCOMES, read_result
 from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES
 
 ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
@@ -220,3 +220,20 @@ def test_result_of_another_protocol_is_refused(study):
     other = write(folder / "other", outcomes, protocol="clutter-v1", protocol_hash="0" * 64, policy=policy)
     with pytest.raises(EvaluationError):
         make_study([results["middle"], other], protocol)
+
+
+def test_two_results_of_the_same_policy_are_refused(study):
+    folder, protocol, results = study
+    shutil.copytree(results["weak"].folder, folder / "again")
+    with pytest.raises(EvaluationError):
+        make_study([*results.values(), read_result(folder / "again")], protocol)
+
+
+def test_episodes_that_are_not_in_the_protocol_are_refused(study):
+    folder, protocol, results = study
+    copy = shutil.copytree(results["weak"].folder, folder / "longer")
+    path = copy / OUTCOMES
+    line = json.loads(path.read_text().splitlines()[0]) | {"episode": len(protocol.episodes)}
+    path.write_text(path.read_text() + json.dumps(line) + "\n")
+    with pytest.raises(EvaluationError):
+        make_study([results["middle"], read_result(copy)], protocol)

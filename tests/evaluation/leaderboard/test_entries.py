@@ -1,5 +1,6 @@
 """Results in entries of the leaderboard: all outcomes, and the actions of a sample that the protocol fixes."""
 
+import json
 import shutil
 
 import pytest
@@ -9,7 +10,7 @@ from robocas_ms3.cli.leaderboard import Add, add
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import OUTCOMES, read_result
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
 
 CONFIGS = {episode.config for episode in load_protocol("smoke").episodes}
 
@@ -69,7 +70,7 @@ def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch
 
 
 def test_bad_results_are_refused_and_nothing_is_written(result, tmp_path):
-    out, other = tmp_path / "entry" / "smoke", tmp_path / "other"
+    out, other = tmp_path / "entry" / "smoke", tmp_path / "other" / "smoke"
     add(Add((result.folder,), out=out))
     with pytest.raises(OutputExistsError):
         add(Add((result.folder,), out=out))
@@ -81,8 +82,33 @@ def test_bad_results_are_refused_and_nothing_is_written(result, tmp_path):
         add(Add((result.folder,), out=other))
     assert error.value.found == "1 episode missing"
     outcomes.write_text("".join(lines[2:]))  # no episode of pick
-    assert add(Add((result.folder,), out=tmp_path / "without-pick")) == 0
+    assert add(Add((result.folder,), out=tmp_path / "without-pick" / "smoke")) == 0
     (result.folder / "actions" / "000002.npz").unlink()
     with pytest.raises(EvaluationError, match="1 violation"):
         add(Add((result.folder,), out=other))
     assert not other.exists()
+
+
+def test_other_folders_keep_their_readme(result, tmp_path):
+    card = tmp_path / "card.md"
+    card.write_text("# Model card: mine\n")
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "README.md").write_text("# My project\n")
+    with pytest.raises(EvaluationError):  # the folder has another name than the protocol
+        add(Add((result.folder,), out=project / "mine", card=card, overwrite=True))
+    with pytest.raises(OutputExistsError):
+        add(Add((result.folder,), out=project / "smoke", card=card, overwrite=True))
+    assert (project / "README.md").read_text() == "# My project\n"
+    assert not (project / "smoke").exists()
+
+
+def test_a_result_that_gives_no_rows_is_a_violation(result, tmp_path):
+    out, card, protocol = tmp_path / "entry" / "smoke", tmp_path / "card.md", load_protocol("smoke")
+    card.write_text("# Model card: mine\n")
+    add(Add((result.folder,), out=out, card=card))
+    assert entries.find_result_violations(read_result(out), protocol) == []
+    record = json.loads((out / RUN).read_text())
+    (out / RUN).write_text(json.dumps(record | {"policy": record["policy"] | {"parameters": "12M"}}))
+    (violation,) = entries.find_result_violations(read_result(out), protocol)
+    assert "parameters" in violation

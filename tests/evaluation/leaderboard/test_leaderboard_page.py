@@ -1,11 +1,17 @@
 """The page of the leaderboard: rows with ranks, filters, stages, links to videos, and untrusted texts."""
 
 import json
+import math
 import re
+from dataclasses import replace
 
+import pytest
 from synthetic_results import of_protocol
 
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.leaderboard.entries import find_card
+from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.output import PAGE, ROWS, AuditedResult, rank_rows, write_leaderboard_page
 from robocas_ms3.evaluation.leaderboard.page import video_folder
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
@@ -15,17 +21,20 @@ from robocas_ms3.evaluation.results import RUN, read_result
 SMOKE = load_protocol("smoke")
 
 
-def rename(result, name):
+def change_policy(result, **values):
+    return change_run(result, policy=result.run.policy.model_dump(exclude_unset=True) | values)
+
+
+def change_run(result, **values):
     record = json.loads((result.folder / RUN).read_text())
-    record["policy"]["name"] = name
-    (result.folder / RUN).write_text(json.dumps(record))
+    (result.folder / RUN).write_text(json.dumps(record | values))
     return read_result(result.folder)
 
 
 def make_results(tmp_path, *names):
     return [
-        AuditedResult(rename(of_protocol(tmp_path / f"entry{number}" / "smoke", SMOKE), name), SMOKE, 3)
-        for number, name in enumerate(names)
+        AuditedResult(of_protocol(tmp_path / name / "smoke", SMOKE), SMOKE, {0: "exact", 1: "exact", 2: "checkpoints"})
+        for name in names
     ]
 
 
@@ -34,12 +43,14 @@ def test_page_has_a_row_per_task_and_the_published_results(tmp_path):
     assert [path.name for path in write_leaderboard_page(results, out)] == ["index.html", "results.md", "results.json"]
     rows = [row for row in read_leaderboard(out / ROWS).rows if not row.published]
     tasks = {episode.task for episode in SMOKE.episodes}
-    assert {(row.policy, row.task) for row in rows} == {(name, task) for name in ("first", "second") for task in tasks}
-    assert {(row.rank, row.audited) for row in rows} == {(1, 3)}  # equal results are ties
+    assert {(row.entry, row.task) for row in rows} == {(name, task) for name in ("first", "second") for task in tasks}
+    assert {row.rank for row in rows} == {1}  # equal results are ties
+    audited = {(row.task, row.audited, row.audited_with_tolerances) for row in rows}
+    assert audited == {("pick", 2, 0), ("select", 0, 1), ("search", 0, 0), ("open_pick", 0, 0)}
     page = (out / PAGE).read_text()
-    assert page.count("<td>first</td>") == page.count("<td>second</td>") == len(tasks)
+    assert page.count("<td>first (mine)</td>") == page.count("<td>second (mine)</td>") == len(tasks)
     assert len(re.findall("<summary>(?:first|second), smoke</summary>", page)) == 2
-    assert "RT-1" in page and "<option>first</option>" in page
+    assert "RT-1" in page and "<option>first (mine)</option>" in page
 
 
 def test_page_has_the_model_card_of_each_entry(tmp_path):
@@ -52,15 +63,20 @@ def test_page_has_the_model_card_of_each_entry(tmp_path):
 def test_videos_in_the_folder_of_a_result_are_linked(tmp_path):
     results, out = make_results(tmp_path, "first"), tmp_path / "out"
     folder = video_folder(out, results[0].result)
-    assert folder == out / "videos" / "entry0" / "smoke"
+    assert folder.parent == out / "videos" / "first" / "smoke"
     folder.mkdir(parents=True)
     (folder / "episode_00001.mp4").touch()
     write_leaderboard_page(results, out)
-    assert '<a href="videos/entry0/smoke/episode_00001.mp4">' in (out / PAGE).read_text()
+    link = f'<a href="videos/first/smoke/{folder.name}/episode_00001.mp4">'
+    assert link in (out / PAGE).read_text()
+    other = change_run(results[0].result, action_noise=[1.0, 1.0])  # another result in the same folder
+    write_leaderboard_page([results[0]._replace(result=other)], out)
+    assert link not in (out / PAGE).read_text()
 
 
 def test_texts_of_results_create_no_html_and_no_paths(tmp_path):
-    results = make_results(tmp_path, "../../<script>alert(1)</script>")
+    (true,) = make_results(tmp_path, "first")
+    results = [true._replace(result=change_policy(true.result, name="../../<script>alert(1)</script>"))]
     write_leaderboard_page(results, tmp_path / "out")
     page = (tmp_path / "out" / PAGE).read_text()
     assert "<script>alert" not in page and "&lt;script&gt;alert" in page
@@ -69,9 +85,38 @@ def test_texts_of_results_create_no_html_and_no_paths(tmp_path):
 
 def test_policies_of_different_tracks_are_not_ranked_together(tmp_path):
     results = make_results(tmp_path, "first", "second")
-    record = json.loads((results[1].result.folder / RUN).read_text())
-    record["policy"]["spec"]["track"] = "privileged"
-    (results[1].result.folder / RUN).write_text(json.dumps(record))
-    results[1] = results[1]._replace(result=read_result(results[1].result.folder))
+    spec = {"track": "privileged", "rate_hz": 20}
+    results[1] = results[1]._replace(result=change_policy(results[1].result, spec=spec))
     assert all(row.rank_p_value is None for row in rank_rows(results))
     assert any(row.rank_p_value is not None for row in rank_rows(make_results(tmp_path / "again", "a", "b")))
+
+
+def test_rows_with_differences_have_no_rank(tmp_path):
+    results = make_results(tmp_path, "first", "second")
+    results[1] = results[1]._replace(result=change_run(results[1].result, action_noise=[5.0, 2.0]))
+    assert {(row.entry, row.rank) for row in rank_rows(results)} == {("first", 1), ("second", None)}
+
+
+def test_a_policy_is_in_the_leaderboard_once_but_names_of_policies_may_be_equal(tmp_path):
+    results = make_results(tmp_path, "first", "second")
+    assert {row.name for row in rank_rows(results)} == {"first (mine)", "second (mine)"}
+    weights = [one._replace(result=change_policy(one.result, weights="ab" * 32)) for one in results]
+    with pytest.raises(EvaluationError):
+        rank_rows(weights)
+
+
+def test_success_that_differs_in_episodes_without_stored_actions_is_noted(tmp_path, monkeypatch):
+    monkeypatch.setattr(entries, "SAMPLE_SIZE", 25)
+    protocol = load_protocol("paper-v1")
+    folder, picks = tmp_path / "mine" / "paper-v1", {one.episode for one in protocol.episodes if one.task == "pick"}
+    made = of_protocol(folder, protocol)
+    stored = set(entries.list_stored_episodes(made, protocol))
+    failed = {number: replace(one, success=number not in stored) for number, one in made.outcomes.items()}
+    (row, *_) = rank_rows([AuditedResult(replace(made, outcomes=failed), protocol, {})])
+    inside = len(stored & picks)
+    assert row.task == "pick" and row.sample_p_value is not None
+    # Fisher's exact test: all successes are outside of the sample in one of comb(200, inside) ways
+    assert row.sample_p_value == pytest.approx(1 / math.comb(200, inside), rel=1e-6)
+    assert "with and without stored actions" in render_leaderboard([row])
+    (row, *_) = rank_rows([AuditedResult(made, protocol, {})])
+    assert row.sample_p_value == 1 and "with and without" not in render_leaderboard([row])

@@ -148,7 +148,7 @@ def test_command_writes_rows_of_all_results_and_the_published_ones(tmp_path, cap
 def test_results_that_are_not_audited_are_marked_and_not_added_to_a_leaderboard(tmp_path):
     (row,) = make_rows(write(tmp_path / "a", [outcome(0)]))
     assert "not audited" in render_leaderboard([row])
-    audited = row.model_copy(update={"audited": 1, "rank": 1})
+    audited = row.model_copy(update={"entry": "mine", "audited": 1, "rank": 1})
     assert "not audited" not in render_leaderboard([audited])
     assert "not audited" in render_leaderboard([audited, row])
     out = tmp_path / "rows.json"
