@@ -27,7 +27,7 @@ NOTE = (
     "policy. An audit shows that the stored actions have these outcomes, but not which policy chose them."
 )
 _HEADS = (
-    *("protocol", "task", "split", "track", "rank#", "policy", "success#", "0 to 100 %", "n#", "p#", "audited"),
+    *("protocol", "task", "split", "track", "rank#", "policy", "success#", "0 to 100 %", "n#", "p#", "audited#"),
     *("trained here", "training data", "training", "parameters#", "notes"),
 )
 _FILTERS = ("protocol", "task", "split", "track", "policy", "trained here", "training data")
@@ -65,7 +65,7 @@ def _render_filters(rows: Sequence[Sequence[str]]) -> str:
     labels = []
     for name in _FILTERS:
         column = _HEADS.index(name)
-        options = "".join(f"<option>{value}</option>" for value in sorted({row[column] for row in rows}))
+        options = "".join(f"<option>{value}</option>" for value in sorted({row[column] for row in rows} - {""}))
         choices = f'<option value="">all</option>{options}'
         labels.append(f'<label>{name} <select data-column="{column}">{choices}</select></label>\n')
     return f'<form class="filters">{"".join(labels)}</form>\n'

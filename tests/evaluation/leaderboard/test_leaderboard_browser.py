@@ -1,0 +1,56 @@
+"""The page of the leaderboard in a browser, with the entries of this project: no overflow, no errors, and filters."""
+
+from pathlib import Path
+
+import pytest
+from browser import open_page
+
+from robocas_ms3.evaluation.leaderboard.entries import find_results
+from robocas_ms3.evaluation.leaderboard.output import PAGE, AuditedResult, write_leaderboard_page
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.results import read_result
+
+pytestmark = pytest.mark.slow
+ENTRIES = Path(__file__).resolve().parents[3] / "leaderboard"
+SHOWN = """column => [...document.querySelectorAll('table.filtered tbody tr')]
+    .filter(row => !row.hidden).map(row => row.cells[column].textContent)"""
+
+
+@pytest.fixture(scope="module")
+def page():
+    with open_page() as page:
+        yield page
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    out = tmp_path_factory.mktemp("leaderboard")
+    results = [read_result(folder) for folder in find_results(ENTRIES)]
+    write_leaderboard_page([AuditedResult(one, load_protocol(one.run.protocol), {}) for one in results], out)
+    return f"file://{out / PAGE}"
+
+
+@pytest.mark.parametrize(("width", "dark"), [(420, True), (1440, False)])
+def test_page_has_no_errors_and_no_overflow(page, url, width, dark):
+    page.set_viewport_size({"width": width, "height": 900})
+    page.emulate_media(color_scheme="dark" if dark else "light")
+    page.goto(url)
+    assert page.errors == []
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    paper, ink = page.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
+    assert (paper == "rgb(20, 23, 27)") == dark
+    assert paper != ink
+
+
+@pytest.mark.parametrize("name", ["protocol", "track", "training data"])
+def test_each_choice_of_a_filter_shows_its_rows(page, url, name):
+    page.goto(url)
+    selection = f"label:has-text('{name}') select"
+    column = page.get_attribute(selection, "data-column")
+    choices = page.eval_on_selector_all(f"{selection} option", "found => found.map(option => option.value)")
+    assert choices[0] == "" and len(choices) > 3
+    page.select_option(selection, "")
+    everything = page.evaluate(SHOWN, column)
+    for value in choices[1:]:
+        page.select_option(selection, value)
+        assert page.evaluate(SHOWN, column) == [value] * everything.count(value) != []
