@@ -6,9 +6,10 @@
     python scripts/choose_scenes.py candidates --scenes 300 --name mine --out protocols/mine
 
 The episodes are grouped by task and number of removals (docs/difficulty.md). All groups get the same number of scenes
-if they have enough; within a group, scenes are chosen evenly over the visible fraction of the target. The written
-protocol has the frozen layouts of its episodes, and their difficulties. Several protocols may be given, such as those
-measured on different machines: then the episodes of all of them are candidates. Run the script with .venv/bin/python.
+if they have enough; within a group, scenes are chosen at equal distances in the order of the visible fraction of the
+target. The written protocol has the frozen layouts of its episodes, and their difficulties. Several protocols may be
+given, such as those measured on different machines: then the episodes of all of them are candidates. Run the script
+with .venv/bin/python.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 import tyro
 import yaml
 
+from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.documents import load_yaml
 from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.core.files import atomic_folder, make_folder
@@ -90,6 +92,8 @@ class Options:
 def main(options: Options) -> None:
     if not options.protocols:
         raise EvaluationError("no protocol", expected="at least one PROTOCOL", fix="See --help for an example.")
+    check_number("--scenes", options.scenes, 1)
+    check_number("--min-removals", options.min_removals, 0)
     check_replaceable(options.out)
     protocols = [load_protocol(name) for name in options.protocols]
     rules = read_shared_rules(protocols)
@@ -131,7 +135,7 @@ def read_scenes(protocols: Sequence[LoadedProtocol]) -> list[Scene]:
 
 
 def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int) -> list[Scene]:
-    """Choose up to ``count`` scenes, as many of each group as possible, and evenly over the visible fraction."""
+    """Choose up to ``count`` scenes, as many of each group as possible, evenly in the order of the visible fraction."""
     sizes = dict.fromkeys(groups, 0)
     for _ in range(min(count, sum(map(len, groups.values())))):
         smallest = min((key for key in groups if sizes[key] < len(groups[key])), key=lambda key: (sizes[key], key))
