@@ -5,7 +5,8 @@ python benchmarks/tampering.py --work tampering > tampering.json
 The script evaluates `scripted-ee-delta` and `noop` on the protocol smoke. Then it changes every value of run.json, of
 an outcome of pick and of a retrieval order of search (``fields``). It also forges results consistently, with hashes and
 related values (``forgeries``). Each changed copy goes through the checks of `robocas eval verify` and
-`robocas eval audit`, which replays three episodes.
+`robocas eval audit`, which replays three episodes. The exit status is 1 if a forgery is not found by the check that is
+expected for it.
 
 JSON keys:
   found            number of changes by the check that finds them
@@ -29,13 +30,12 @@ from typing import Any
 import numpy as np
 import tyro
 
-from robocas_ms3.cli.eval_results import find_protocol_of
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.audit.run import find_audit_obstacle, run_audit
 from robocas_ms3.evaluation.outcomes import Checkpoints
 from robocas_ms3.evaluation.policies import open_policy
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, load_protocol_of, read_result
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stored_episodes import hash_actions, write_actions, write_checkpoints
@@ -51,6 +51,8 @@ Forgery = Callable[["ResultCopy"], None]
 class Benchmark:
     work: Path
     """Folder of the results; those of an earlier run are used again."""
+    fields: bool = True
+    """Whether to change every single value too."""
 
 
 class ResultCopy:
@@ -243,39 +245,44 @@ def claim_no_fallen_objects(copy: ResultCopy) -> None:
     copy.change(SEARCH, measures=measures, retrieval={"moved": [], "needed": [], "left": 0, "score": 1.0})
 
 
-FORGERIES: dict[str, tuple[str, Forgery]] = {
-    "success alone": ("noop", claim_success_alone),
-    "success without the stages before it": ("noop", claim_only_the_last_stage),
-    "success with all stages": ("noop", claim_success),
-    "success in all episodes": ("noop", claim_all_successes),
-    "earlier success, with cut actions and states": ("scripted-ee-delta", claim_an_earlier_success),
-    "earlier stage": ("scripted-ee-delta", claim_an_earlier_stage),
-    "shorter path": ("scripted-ee-delta", change_measure("path_length", 0.5)),
-    "smaller contact impulse": ("scripted-ee-delta", change_measure("contact_impulse", 0.01)),
-    "no disturbed objects in search, perfect order": ("scripted-ee-delta", claim_no_fallen_objects),
-    "exchanged episodes": ("scripted-ee-delta", exchange_episodes),
-    "repeated episode": ("scripted-ee-delta", repeat_an_episode),
-    "missing episode": ("scripted-ee-delta", leave_out_an_episode),
-    "another seed": ("scripted-ee-delta", use_another_seed),
-    "actions of another policy": ("scripted-ee-delta", use_actions_of_noop),
-    "scaled actions": ("scripted-ee-delta", scale_actions),
-    "one shifted action": ("scripted-ee-delta", shift_one_action),
-    "changed actions, old hash": ("scripted-ee-delta", change_actions_without_hash),
-    "NaN in the actions": ("scripted-ee-delta", store_a_nan),
-    "deleted actions": ("scripted-ee-delta", delete_actions),
-    "no hash of the actions": ("scripted-ee-delta", omit_the_hash),
-    "changed state": ("scripted-ee-delta", move_an_object_in_the_states),
-    "missing states": ("scripted-ee-delta", leave_out_states),
-    "more steps than allowed": ("scripted-ee-delta", add_steps),
-    "half the rate": ("scripted-ee-delta", halve_the_rate),
-    "error in a successful episode": ("scripted-ee-delta", add_an_error),
-    "another protocol": ("scripted-ee-delta", lambda copy: copy.change_run(protocol_hash="ef" * 32)),
-    "another object pack": ("scripted-ee-delta", lambda copy: copy.change_run(pack_hashes={"builtin": "ef" * 32})),
-    "weld": ("scripted-ee-delta", lambda copy: copy.change_run(weld=True)),
-    "action noise": ("scripted-ee-delta", lambda copy: copy.change_run(action_noise=[5.0, 2.0])),
-    "other versions": ("scripted-ee-delta", lambda copy: copy.change_run(versions={"sapien": "2.0"})),
-    "GPU physics": ("scripted-ee-delta", lambda copy: copy.change_run(backend="gpu")),
+FORGERIES: dict[str, tuple[str, str, Forgery]] = {
+    "success alone": ("noop", "verify", claim_success_alone),
+    "success without the stages before it": ("noop", "verify", claim_only_the_last_stage),
+    "success with all stages": ("noop", "audit", claim_success),
+    "success in all episodes": ("noop", "verify", claim_all_successes),
+    "earlier success, with cut actions and states": ("scripted-ee-delta", "audit", claim_an_earlier_success),
+    "earlier stage": ("scripted-ee-delta", "audit", claim_an_earlier_stage),
+    "shorter path": ("scripted-ee-delta", "audit", change_measure("path_length", 0.5)),
+    "smaller contact impulse": ("scripted-ee-delta", "audit", change_measure("contact_impulse", 0.01)),
+    "no disturbed objects in search, perfect order": ("scripted-ee-delta", "audit", claim_no_fallen_objects),
+    "exchanged episodes": ("scripted-ee-delta", "audit", exchange_episodes),
+    "repeated episode": ("scripted-ee-delta", "none", repeat_an_episode),
+    "missing episode": ("scripted-ee-delta", "verify", leave_out_an_episode),
+    "another seed": ("scripted-ee-delta", "verify", use_another_seed),
+    "actions of another policy": ("scripted-ee-delta", "audit", use_actions_of_noop),
+    "scaled actions": ("scripted-ee-delta", "audit", scale_actions),
+    "one shifted action": ("scripted-ee-delta", "audit", shift_one_action),
+    "changed actions, old hash": ("scripted-ee-delta", "verify", change_actions_without_hash),
+    "NaN in the actions": ("scripted-ee-delta", "verify", store_a_nan),
+    "deleted actions": ("scripted-ee-delta", "verify", delete_actions),
+    "no hash of the actions": ("scripted-ee-delta", "verify", omit_the_hash),
+    "changed state": ("scripted-ee-delta", "audit", move_an_object_in_the_states),
+    "missing states": ("scripted-ee-delta", "audit", leave_out_states),
+    "more steps than allowed": ("scripted-ee-delta", "verify", add_steps),
+    "half the rate": ("scripted-ee-delta", "verify", halve_the_rate),
+    "error in a successful episode": ("scripted-ee-delta", "read", add_an_error),
+    "another protocol": ("scripted-ee-delta", "verify", lambda copy: copy.change_run(protocol_hash="ef" * 32)),
+    "another object pack": (
+        "scripted-ee-delta",
+        "verify",
+        lambda copy: copy.change_run(pack_hashes={"builtin": "ef" * 32}),
+    ),
+    "weld": ("scripted-ee-delta", "verify", lambda copy: copy.change_run(weld=True)),
+    "action noise": ("scripted-ee-delta", "audit", lambda copy: copy.change_run(action_noise=[5.0, 2.0])),
+    "other versions": ("scripted-ee-delta", "audit", lambda copy: copy.change_run(versions={"sapien": "2.0"})),
+    "GPU physics": ("scripted-ee-delta", "audit", lambda copy: copy.change_run(backend="gpu")),
 }
+"""Changed result, check that must find the forgery, and the change, by name of the forgery."""
 
 
 def main(cfg: Benchmark) -> None:
@@ -296,13 +303,17 @@ def main(cfg: Benchmark) -> None:
         unchanged = check_change(source, f"unchanged result of {policy}", lambda copy: None)
         if unchanged["found_by"] != "none":
             raise SystemExit(f"error: {unchanged}")
-    fields = [check_change(true_result, name, change) for name, change in list_field_changes(true_result)]
-    forgeries = [check_change(sources[policy], name, forge) for name, (policy, forge) in FORGERIES.items()]
+    changes = list_field_changes(true_result) if cfg.fields else ()
+    fields = [check_change(true_result, name, change) for name, change in changes]
+    forgeries = [check_change(sources[policy], name, forge) for name, (policy, _, forge) in FORGERIES.items()]
     found = {
         kind: Counter(change["found_by"] for change in changes)
         for kind, changes in (("fields", fields), ("forgeries", forgeries))
     }
     print(json.dumps({"found": found, "fields": fields, "forgeries": forgeries}, indent=1))
+    wrong = [one for one in forgeries if one["found_by"] != FORGERIES[one["change"]][1]]
+    if wrong:
+        raise SystemExit(f"error: not found by the expected check: {json.dumps(wrong)}")
 
 
 def evaluate(policy: str, out: Path) -> Path:
@@ -318,7 +329,7 @@ def check_result(folder: Path, audit: Path) -> tuple[str, str]:
     """Return the check that finds something in a result, and its first message; ``none`` and an empty message: none."""
     try:
         result = read_result(folder)
-        protocol = find_protocol_of(result, None)
+        protocol = load_protocol_of(result)
         if violations := find_violations(result, protocol):
             return "verify", violations[0]
         if obstacle := find_audit_obstacle(result):

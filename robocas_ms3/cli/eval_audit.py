@@ -62,15 +62,14 @@ class Audit(ReplayOptions):
 
 @resumable
 def audit(cfg: Audit) -> int:
-    from robocas_ms3.cli.eval_results import find_protocol_of
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.audit.run import find_audit_obstacle
-    from robocas_ms3.evaluation.results import read_result
+    from robocas_ms3.evaluation.results import load_protocol_of, read_result
     from robocas_ms3.evaluation.verify import find_violations
 
     cfg.check()
     result = read_result(cfg.folder)
-    protocol = find_protocol_of(result, cfg.protocol)
+    protocol = load_protocol_of(result, cfg.protocol)
     if violations := find_violations(result, protocol, is_complete=False):
         for violation in violations:
             print_line(violation)

@@ -37,7 +37,7 @@ class ClutterScale:
 
 
 def clutter_scale(cfg: ClutterScale) -> int:
-    from robocas_ms3.cli.eval_results import find_protocol_of, read_evaluations
+    from robocas_ms3.cli.eval_results import read_evaluations
     from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.core.errors import require_extra
     from robocas_ms3.core.files import make_folder
@@ -47,9 +47,10 @@ def clutter_scale(cfg: ClutterScale) -> int:
     from robocas_ms3.evaluation.clutter_scale.figure import write_curves
     from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
     from robocas_ms3.evaluation.clutter_scale.study import describe_rates, make_study
+    from robocas_ms3.evaluation.results import load_protocol_of
 
     results = read_evaluations(cfg.folders)
-    study = make_study(results, find_protocol_of(results[0], cfg.protocol), fit=cfg.fit)
+    study = make_study(results, load_protocol_of(results[0], cfg.protocol), fit=cfg.fit)
     make_folder(cfg.out)
     study.write(cfg.out)
     write_curves(study, cfg.out / "clutter_scale.png")

@@ -131,13 +131,13 @@ def merge(cfg: Merge) -> int:
 def compare(cfg: Compare) -> int:
     from robocas_ms3.cli.terminal import print_text
     from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
-    from robocas_ms3.evaluation.results import group_partial_results, read_result
+    from robocas_ms3.evaluation.results import group_partial_results, load_protocol_of, read_result
 
     _check_folders(cfg.folders)
     groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else group_partial_results(cfg.folders)
     results = [read_result(*parts) for parts in groups]
     if len(results) == 1:
-        print_text(compare_splits(results[0], find_protocol_of(results[0], cfg.protocol)))
+        print_text(compare_splits(results[0], load_protocol_of(results[0], cfg.protocol)))
     else:
         print_text(compare_results(results))
     return 0
@@ -186,10 +186,11 @@ def table(cfg: WriteTable) -> int:
 def verify(cfg: Verify) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.report.tables import name_measurement
+    from robocas_ms3.evaluation.results import load_protocol_of
     from robocas_ms3.evaluation.verify import find_violations
 
     result = read(cfg.folders)
-    found = find_violations(result, find_protocol_of(result, cfg.protocol))
+    found = find_violations(result, load_protocol_of(result, cfg.protocol))
     for violation in found:
         print_line(violation)
     if broken := result.count_errors():
@@ -205,10 +206,11 @@ def videos(cfg: Videos) -> int:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
+    from robocas_ms3.evaluation.results import load_protocol_of
 
     check_number("--count", cfg.count, 1)
     result = read((cfg.folder,))
-    protocol, name = find_protocol_of(result, cfg.protocol), result.run.policy.name
+    protocol, name = load_protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
         fix = f"Add --policy {name} if you trust its code."
         raise EvaluationError("the policy of this result has no registered name", where=cfg.folder, found=name, fix=fix)
@@ -267,22 +269,10 @@ def read_evaluations(folders: tuple[Path, ...]) -> list[Result]:
 def _find_protocol(result: Result, given: str | None) -> LoadedProtocol | None:
     """Load the protocol of a result; None if it is not bundled and not given, or has other files."""
     from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.evaluation.results import load_protocol_of
 
     try:
-        loaded = find_protocol_of(result, given)
+        loaded = load_protocol_of(result, given)
     except EvaluationError:
         return None
     return loaded if loaded.hash == result.run.protocol_hash else None
-
-
-def find_protocol_of(result: Result, given: str | None) -> LoadedProtocol:
-    """Load the protocol of --protocol, or the bundled protocol that the result names."""
-    from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-    from robocas_ms3.evaluation.protocol import load_protocol
-
-    name, bundled = result.run.protocol, bundled_protocols()
-    if given is None and name not in bundled:
-        what, fix = "the protocol of the result is not bundled", "Pass --protocol FOLDER."
-        raise EvaluationError(what, where=result.folder, expected=f"one of {', '.join(bundled)}", found=name, fix=fix)
-    return load_protocol(bundled[name] if given is None else given)

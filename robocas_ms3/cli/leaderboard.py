@@ -67,12 +67,13 @@ class Build(ReplayOptions):
 
 
 def add(cfg: Add) -> int:
-    from robocas_ms3.cli.eval_results import find_protocol_of, read
+    from robocas_ms3.cli.eval_results import read
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.leaderboard.entries import find_card, write_result
+    from robocas_ms3.evaluation.results import load_protocol_of
 
     result = read(cfg.folders)
-    protocol = find_protocol_of(result, cfg.protocol)
+    protocol = load_protocol_of(result, cfg.protocol)
     sample = write_result(result, protocol, cfg.out, card=cfg.card, overwrite=cfg.overwrite)
     print_line(f"wrote {cfg.out}: {format_count(len(result.outcomes), 'episode')}, actions of {len(sample)}")
     if not find_card(cfg.out).exists():
@@ -121,17 +122,16 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
 
     An audit is stored in a subfolder of ``cache`` named by its hash, so that it is continued and not repeated.
     """
-    from robocas_ms3.cli.eval_results import find_protocol_of
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit
     from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
-    from robocas_ms3.evaluation.results import read_result
+    from robocas_ms3.evaluation.results import load_protocol_of, read_result
 
     try:
         result = read_result(folder)
-        protocol = find_protocol_of(result, None)
+        protocol = load_protocol_of(result)
         problems = find_result_violations(result, protocol)
     except EvaluationError as error:
         print_line(f"{folder}: {error}")

@@ -27,8 +27,10 @@ from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
 from robocas_ms3.core.strict_model import parse
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.outcomes import Checkpoints, EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
+from robocas_ms3.evaluation.protocol import LoadedProtocol, load_protocol
 from robocas_ms3.evaluation.run_record import MergedFolder, RunRecord
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 from robocas_ms3.evaluation.stored_episodes import (
@@ -193,6 +195,19 @@ def read_result(*folders: Path) -> Result:
         ]
         run = run.model_copy(update={"merged_from": records})
     return Result(first.folder, run, dict(sorted(outcomes.items())), sources)
+
+
+def load_protocol_of(result: Result, given: str | None = None) -> LoadedProtocol:
+    """Load the protocol of a result: the bundled one with its name, or ``given``, a name or folder.
+
+    Raises:
+        EvaluationError: the protocol is not bundled and not given, or cannot be read.
+    """
+    name, bundled = result.run.protocol, bundled_protocols()
+    if given is None and name not in bundled:
+        what, fix = "the protocol of the result is not bundled", "Pass --protocol FOLDER."
+        raise EvaluationError(what, where=result.folder, expected=f"one of {', '.join(bundled)}", found=name, fix=fix)
+    return load_protocol(bundled[name] if given is None else given)
 
 
 def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:

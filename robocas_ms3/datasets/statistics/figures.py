@@ -49,6 +49,14 @@ def make_figure(width: float, height: float) -> Any:
         return Figure(figsize=(width, height), layout="constrained")
 
 
+def choose_colors(count: int) -> list[Any]:
+    """Return colours of lines, which differ for up to 20 lines."""
+    from matplotlib import colormaps
+
+    palette = colormaps["tab10" if count <= 10 else "tab20"].colors
+    return [palette[number % len(palette)] for number in range(count)]
+
+
 def make_axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
     """Return the first ``count`` axes of a grid of rows and columns, without upper and right spines."""
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()

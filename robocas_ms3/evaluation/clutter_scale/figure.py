@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from robocas_ms3.core.files import atomic_file
-from robocas_ms3.datasets.statistics.figures import DPI, make_axes, make_figure
+from robocas_ms3.datasets.statistics.figures import DPI, choose_colors, make_axes, make_figure
 from robocas_ms3.evaluation.clutter_scale.item_response import HARDEST
 from robocas_ms3.evaluation.clutter_scale.study import ClutterStudy
 
@@ -16,15 +16,12 @@ _DASHED = "privileged"  # track whose curves are dashed
 
 def write_curves(study: ClutterStudy, path: Path) -> None:
     """Write the curves of all policies, and the number of scenes by difficulty, as PNG; one column per task."""
-    from matplotlib import colormaps
-
     columns = len(study.tasks)
     figure = make_figure(1.5 + 5 * columns, 5.5)
     axes = make_axes(figure, 2, columns, 2 * columns)
     figure.get_layout_engine().set(h_pad=0.1)
     names = dict.fromkeys(policy.name for task in study.tasks.values() for policy in task.policies)
-    palette = colormaps["tab10" if len(names) <= 10 else "tab20"]
-    colors = {name: palette(number) for number, name in enumerate(names)}
+    colors = dict(zip(names, choose_colors(len(names)), strict=True))
     lines = {}
     difficulty = np.linspace(0, HARDEST, 101)
     for column, (name, task) in enumerate(study.tasks.items()):
