@@ -4,6 +4,7 @@ python benchmarks/difficulty.py --config search_table_stacked --scenes 20
 
 JSON keys:
   config                task configuration
+  grasp_attempts        number of attempts to grasp the target
   scenes                number of measured scenes
   cpu_seconds           mean, median and maximum of the CPU seconds per scene, with all forked processes
   simulated_removals    mean and maximum of the simulated removals per scene
@@ -32,6 +33,8 @@ class Benchmark:
     """Seed of the first scene."""
     scenes: int = 20
     """Number of scenes."""
+    grasp_attempts: int = 3
+    """Number of attempts, of which one must grasp the target."""
 
 
 def main(cfg: Benchmark) -> None:
@@ -48,7 +51,7 @@ def main(cfg: Benchmark) -> None:
     seconds, scenes = [], []
     for seed in range(cfg.seed, cfg.seed + cfg.scenes):
         start = sum(os.times()[:4])
-        scenes.append(measure_difficulty(generator, seed, RemovalLimits()))
+        scenes.append(measure_difficulty(generator, seed, RemovalLimits(grasp_attempts=cfg.grasp_attempts)))
         seconds.append(sum(os.times()[:4]) - start)
     generator.close()
     simulated = [scene.simulated_removals for scene in scenes]
@@ -57,6 +60,7 @@ def main(cfg: Benchmark) -> None:
         json.dumps(
             {
                 "config": cfg.config,
+                "grasp_attempts": cfg.grasp_attempts,
                 "scenes": len(scenes),
                 "cpu_seconds": [round(float(f(seconds)), 1) for f in (np.mean, np.median, np.max)],
                 "simulated_removals": [round(float(f(simulated)), 1) for f in (np.mean, np.max)],

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(kw_only=True)
-class ClutterScale:
+class PlacePolicies:
     """Place policies on a scale of the difficulty of scenes: the difficulty that they solve half of the time.
 
     Each task has its own scale, from 0 (easiest scene of the protocol) to 10 (hardest scene). clutter-scale-v1 has a
@@ -36,7 +36,7 @@ class ClutterScale:
     """Output folder."""
 
 
-def clutter_scale(cfg: ClutterScale) -> int:
+def clutter_scale(cfg: PlacePolicies) -> int:
     from robocas_ms3.cli.eval_results import read_evaluations
     from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.core.errors import require_extra

@@ -223,12 +223,13 @@ def test_changed_hash_of_actions_is_found(folder, protocol):
         ("cameras", ["base_camera"]),
         ("calibration", "x"),
         ("n", 1),
+        ("convention", "x"),
     ],
 )
 def test_invalid_specifications_of_the_policy_are_found(folder, protocol, key, value):
     tamper_run(folder, policy={"name": "mine", "spec": {"rate_hz": 20, key: value}})
     (violation,) = find_violations(read_result(folder), protocol)
-    assert violation.startswith(f"policy.spec.{key} is {value}")
+    assert violation.startswith(f"policy.spec.{key}")
 
 
 def test_an_outcome_of_select_is_valid_only_if_the_run_has_played_as(tmp_path):

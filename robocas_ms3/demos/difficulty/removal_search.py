@@ -57,7 +57,7 @@ class RemovalResult:
 
 
 @dataclass(frozen=True)
-class _Outcome:
+class _RemovalOutcome:
     """Outcome of a removal in a forked process.
 
     Attributes:
@@ -119,26 +119,26 @@ class RemovalSearch:
                     break
         return first
 
-    def _try_removal(self, slot: int, left: int) -> _Outcome:
+    def _try_removal(self, slot: int, left: int) -> _RemovalOutcome:
         """Remove an object in the first possible way in a forked process, and search for ``left`` further removals."""
-        outcome = _Outcome(False, False, self._simulated, self._complete)
+        outcome = _RemovalOutcome(False, False, self._simulated, self._complete)
         for way in range(self._scene.ways):
             try:
                 outcome = run_in_forked_process(partial(self._remove, slot, way, left), SEQUENCE_TIMEOUT)
             except ForkedProcessError as error:
                 _log.warning("the removal of slot %d is left out: its process %s", slot, error)
-                outcome = _Outcome(False, False, self._simulated + 1, complete=False)
+                outcome = _RemovalOutcome(False, False, self._simulated + 1, complete=False)
             self._simulated, self._complete = outcome.simulated, outcome.complete
             if outcome.possible:
                 break
         return outcome
 
-    def _remove(self, slot: int, way: int, left: int) -> _Outcome:
+    def _remove(self, slot: int, way: int, left: int) -> _RemovalOutcome:
         """Remove an object, and search for ``left`` further removals; this changes the scene of the process."""
         try:
             self._scene.remove(slot, way)
         except PlanningError:
-            return _Outcome(False, False, self._simulated, self._complete)
+            return _RemovalOutcome(False, False, self._simulated, self._complete)
         self._simulated += 1
         solved = bool(self._find_first(left, stop_early=True)) if left else self._scene.can_grasp()
-        return _Outcome(True, solved, self._simulated, self._complete)
+        return _RemovalOutcome(True, solved, self._simulated, self._complete)
