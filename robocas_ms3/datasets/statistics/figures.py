@@ -53,8 +53,8 @@ def choose_colors(count: int) -> list[Any]:
     """Return colours of lines, which differ for up to 20 lines."""
     from matplotlib import colormaps
 
-    palette = colormaps["tab10" if count <= 10 else "tab20"].colors
-    return [palette[number % len(palette)] for number in range(count)]
+    palette = colormaps["tab10" if count <= 10 else "tab20"]
+    return [palette(number % palette.N) for number in range(count)]
 
 
 def make_axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:

@@ -111,7 +111,8 @@ def _describe_audit(audited: AuditedResult, successes: Mapping[int, bool]) -> di
     p_value = None
     if inside and outside:
         counts = [[sum(some), len(some) - sum(some)] for some in (inside, outside)]
-        p_value = float(fisher_exact(counts).pvalue)
+        found: Any = fisher_exact(counts)  # its type has no attributes
+        p_value = float(found.pvalue)
     modes = [mode for number, mode in audited.modes.items() if number in successes]
     tolerances = modes.count("checkpoints")
     return {
