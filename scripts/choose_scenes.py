@@ -86,7 +86,7 @@ class Options:
     """Number of scenes to choose."""
     min_removals: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Smallest number of removals of the chosen scenes; 1 for questions about the order of removals.
-    From 1 on, scenes in which no sequence of removals was found are left out too."""
+    From 1 on, scenes without a known sequence of removals, or with an incomplete search, are left out too."""
 
 
 def main(options: Options) -> None:
@@ -100,8 +100,12 @@ def main(options: Options) -> None:
     scenes = read_scenes(protocols)
     groups: dict[tuple[str, int], list[Scene]] = defaultdict(list)
     for scene in scenes:
-        if not options.min_removals or (scene.difficulty.removals or 0) >= options.min_removals:
+        removals = (scene.difficulty.removals or 0) if scene.difficulty.complete else 0
+        if removals >= options.min_removals:
             groups[scene.group].append(scene)
+    if not groups:
+        what, fix = "no scene to choose from", "Choose a smaller --min-removals."
+        raise EvaluationError(what, expected=f"scenes with {options.min_removals} or more removals", fix=fix)
     chosen = {scene.key for scene in choose_evenly(groups, options.scenes)}
     rules |= {"name": options.name} | ({"description": options.description} if options.description else {})
     write_protocol(rules, [scene for scene in scenes if scene.key in chosen], options.out)

@@ -86,9 +86,19 @@ def test_chosen_episodes_are_a_protocol_with_their_layouts_and_difficulties(scri
         script.main(script.Options(("clutter-scale-v1",), out, "mine"))
 
 
-def choose(script: ModuleType, out: Path, *protocols: Path | str, scenes: int = 300) -> Path:
-    script.main(script.Options(tuple(map(str, protocols)), out, "mine", scenes=scenes))
+def choose(script: ModuleType, out: Path, *protocols: Path | str, scenes: int = 300, min_removals: int = 0) -> Path:
+    script.main(script.Options(tuple(map(str, protocols)), out, "mine", scenes=scenes, min_removals=min_removals))
     return out
+
+
+def test_scenes_without_known_removals_are_left_out(script, tmp_path):
+    whole = choose(script, tmp_path / "whole", "clutter-scale-v1", min_removals=2)
+    found = read_difficulties_of(load_protocol(whole))
+    assert {scene.removals for scene in found} == {2, 3}
+    assert all(scene.complete for scene in found)
+    with pytest.raises(EvaluationError):
+        choose(script, tmp_path / "none", "clutter-scale-v1", min_removals=4)
+    assert not (tmp_path / "none").exists()
 
 
 def split_protocol(folder: Path, out: Path, numbers: range) -> Path:
