@@ -4,7 +4,7 @@
 #   bash scripts/evaluate_protocols.sh POLICY [PROTOCOL ...]
 #
 # POLICY    a name of `robocas list`, a run folder of `robocas train`, or a folder with one run per task (FOLDER/pick, ...)
-# PROTOCOL  names of protocols (default: all but smoke, clutter-scale-v1, see evaluate_clutter_scale.sh, and removal-order-v1)
+# PROTOCOL  names of protocols (default: all but smoke, removal-order-v1, and clutter-scale-v1, see evaluate_clutter_scale.sh)
 #
 # After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY. With
 # one run per task: OUT/POLICY/PROTOCOL/TASK; tasks without a run are left out. In paper-v1, select has the episodes of pick.

@@ -47,6 +47,10 @@ DESCRIPTIONS = {
         "Scenes of RoboCAS-v0's evaluation of pick with the correct instruction (seen), the name of another object "
         "(wrong), no text (empty). A language-conditioned policy should fail with wrong and empty instructions."
     ),
+    "removal-order-v1": (
+        "Search in heaps in which at least one other object has to be removed first. robocas questions makes questions "
+        "about the order of removals, for vision-language models."
+    ),
     "smoke": "Two episodes per task, to check that the installation works. Too few for a success rate.",
 }
 """Descriptions of the bundled protocols by name."""
