@@ -135,8 +135,8 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
 
     plan, total = summary.plan, len(result.outcomes)
     count = len(plan.episodes)
-    if with_tolerances := list(summary.modes.values()).count("checkpoints"):
-        text = format_count(with_tolerances, "episode")
+    if summary.with_tolerances:
+        text = format_count(summary.with_tolerances, "episode")
         print_line(f"note: {text} diverged and were replayed from checkpoint to checkpoint, with tolerances")
     print_line(
         f"{folder}: {count} of {format_count(total, 'episode')} replayed ({plan.replayed_before} of them earlier), "
@@ -151,7 +151,7 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
     if differing := sum(bool(one.differences) for one in summary.episodes):
         print_line(f"{differing} of {format_count(count, 'episode')} differ from the result")
         return 1
-    print_line("no differences beyond the tolerances" if with_tolerances else "all equal the result")
+    print_line("no differences beyond the tolerances" if summary.with_tolerances else "all equal the result")
     if count < plan.candidates:
         bound = bound_differing_episodes(count, plan.candidates)
         print_line(f"sample with seed {plan.seed}: at most {bound} of the {plan.candidates} differ (95 % confidence)")

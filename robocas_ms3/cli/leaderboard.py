@@ -123,7 +123,7 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
     An audit is stored in a subfolder of ``cache`` named by its hash, so that it is continued and not repeated.
     """
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.core.errors import RobocasError
     from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit
     from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
@@ -133,7 +133,7 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
         result = read_result(folder)
         protocol = load_protocol_of(result)
         problems = find_result_violations(result, protocol)
-    except EvaluationError as error:
+    except RobocasError as error:  # the other results are checked all the same
         print_line(f"{folder}: {error}")
         return None
     if not problems and (obstacle := find_audit_obstacle(result)):
@@ -146,8 +146,8 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
     summary = replay_result(result, protocol, cache / hash_audit(result), cfg, stored=stored)
     if summary.differences:
         return None
-    with_tolerances = list(summary.modes.values()).count("checkpoints")
-    mode = f", {with_tolerances} of them within tolerances from checkpoint to checkpoint" if with_tolerances else ""
+    count = summary.with_tolerances
+    mode = f", {count} of them within tolerances from checkpoint to checkpoint" if count else ""
     sample = "" if cfg.sample is None else f", sample with seed {summary.plan.seed}"
     print_line(f"{folder}: no differences in {format_count(len(summary.episodes), 'episode')}{mode}{sample}")
     return AuditedResult(result, protocol, summary.modes)

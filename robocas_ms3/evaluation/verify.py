@@ -86,7 +86,7 @@ def _find_spec_violations(spec: dict[str, Any]) -> list[str]:
         validate_json(_SPEC, json.dumps(spec))
     except ValidationError as error:
         problems = [(".".join(map(str, one["loc"])), one["input"], one["msg"]) for one in error.errors()]
-        return [f"policy.spec.{key} is {value}: {message}" for key, value, message in problems]
+        return [f"policy.spec.{key} is {str(value)[:80]}: {message}" for key, value, message in problems]
     except EvaluationError as error:  # of `PolicySpec` itself
         return [f"policy.spec.{error}"]
     return []

@@ -40,6 +40,18 @@ def open_page():
         browser.close()
 
 
+def check_layout(page, url, width, dark):
+    """Check that a page has no errors, no horizontal overflow, and the colours of the light or dark scheme."""
+    page.set_viewport_size({"width": width, "height": 900})
+    page.emulate_media(color_scheme="dark" if dark else "light")
+    page.goto(url)
+    assert page.errors == []
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    paper, ink = page.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
+    assert (paper == "rgb(20, 23, 27)") == dark
+    assert paper != ink
+
+
 def wait(page, expression):
     """Wait until an expression is true. Playwright's function evaluates text in the page, which the CSP forbids."""
     end = time.monotonic() + 60

@@ -92,6 +92,11 @@ class AuditSummary:
         ]
 
     @property
+    def with_tolerances(self) -> int:
+        """Return the number of episodes that were replayed from checkpoint to checkpoint."""
+        return list(self.modes.values()).count("checkpoints")
+
+    @property
     def modes(self) -> dict[int, Mode]:
         """Return how each episode was replayed, by its number."""
         return {one.episode: one.mode for one in self.episodes}

@@ -110,9 +110,10 @@ def write_result(
         overwrite: whether to replace an existing result.
 
     Raises:
-        EvaluationError: the result has violations (`find_violations`), or lacks episodes of its configurations, or the
-            folder has not the name of the protocol.
-        OutputExistsError: ``out`` exists, or the entry has another model card, or another kind of folder has a README.
+        EvaluationError: the result has violations (`find_violations`) or lacks episodes of its configurations, or
+            ``out`` has another name than the protocol.
+        OutputExistsError: ``out`` exists, the entry has another model card, or the folder of the entry has no result,
+            but a README.md.
     """
     if violations := find_violations(result, protocol, is_complete=False):
         what, fix = "the result has violations", "Run robocas eval verify to list all."

@@ -46,7 +46,7 @@ def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
     if any(row.rank is not None for row in rows):
         lines += ["", RANK_NOTE]
-    if any(not (row.published or row.audited or row.audited_with_tolerances) for row in rows):
+    if any(not row.published and not row.entry for row in rows):
         lines += ["", NOT_AUDITED_NOTE]
     for row in rows:
         if not row.published:

@@ -20,6 +20,7 @@ from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
 from robocas_ms3.evaluation.leaderboard.rows import (
     Leaderboard,
     LeaderboardRow,
+    get_row_order,
     read_published_rows,
     sort_rows,
     write_leaderboard,
@@ -90,8 +91,8 @@ def rank_rows(results: Sequence[AuditedResult]) -> list[LeaderboardRow]:
             groups.setdefault((row.track, *conditions), []).append((audited, successes))
     ranked = []
     for group in groups.values():
-        rows = sort_rows(row for row, _ in group)
-        group.sort(key=lambda pair: rows.index(pair[0]))
+        group.sort(key=lambda pair: get_row_order(pair[0]))
+        rows = [row for row, _ in group]
         if rows[0].differences:
             ranked += rows
             continue

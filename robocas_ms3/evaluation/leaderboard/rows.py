@@ -140,13 +140,13 @@ class Leaderboard(StrictModel):
 
 def sort_rows(rows: Iterable[LeaderboardRow]) -> list[LeaderboardRow]:
     """Sort rows: measured before published, then by protocol, task, split, track and descending rate."""
-    tracks = get_args(Track)
+    return sorted(rows, key=get_row_order)
 
-    def key(row: LeaderboardRow) -> tuple:
-        rate = row.rate_v0 if row.rate is None else row.rate
-        return row.published, row.protocol, row.task, row.split, tracks.index(row.track), -(rate or 0.0), row.name
 
-    return sorted(rows, key=key)
+def get_row_order(row: LeaderboardRow) -> tuple:
+    """Return the key of `sort_rows`."""
+    track, rate = get_args(Track).index(row.track), row.rate_v0 if row.rate is None else row.rate
+    return row.published, row.protocol, row.task, row.split, track, -(rate or 0.0), row.name
 
 
 def find_seen_row(row: LeaderboardRow, rows: Iterable[LeaderboardRow]) -> LeaderboardRow | None:

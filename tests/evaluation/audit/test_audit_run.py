@@ -24,6 +24,7 @@ from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.report import videos
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -277,6 +278,35 @@ def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeyp
     with pytest.raises(EvaluationError, match="two results of the same policy"):
         leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", envs=1))
     assert not (tmp_path / "page").exists()
+
+
+def test_an_unreadable_result_does_not_hide_the_problems_of_others(folder, card, tmp_path, capsys):
+    for name in ("first", "second"):
+        leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / name / "smoke"))
+    first, second = (tmp_path / "entries" / name / "smoke" for name in ("first", "second"))
+    (first / RUN).write_text("{")
+    forge(second, 1, success_at_end=False)
+    assert leaderboard.audit(leaderboard.AuditEntries((tmp_path / "entries",), envs=1)) == 1
+    printed = capsys.readouterr().out
+    assert f"{first}: " in printed and f"{second}: episode 1" in printed and "2 with problems" in printed
+
+
+def test_a_video_whose_outcome_differs_is_dropped(folder, card, tmp_path, monkeypatch):
+    def record(result, protocol, policy, numbers, out):
+        out.mkdir(parents=True)
+        for number in numbers:
+            path = out / videos.video_file_name(number)
+            path.touch()
+            yield path, number == 1
+
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(videos, "choose_episodes", lambda result, count: [0, 1])
+    monkeypatch.setattr(videos, "record_videos", record)
+    leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / "mine" / "smoke"))
+    assert leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", videos=2, envs=1)) == 0
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert "episode_00001.mp4" in page
+    assert "episode_00000.mp4" not in page
 
 
 def test_an_entry_without_results_is_an_error(tmp_path):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from browser import open_page
+from browser import check_layout, open_page
 
 from robocas_ms3.evaluation.leaderboard.entries import find_results
 from robocas_ms3.evaluation.leaderboard.output import PAGE, AuditedResult, write_leaderboard_page
@@ -32,14 +32,7 @@ def url(tmp_path_factory):
 
 @pytest.mark.parametrize(("width", "dark"), [(420, True), (1440, False)])
 def test_page_has_no_errors_and_no_overflow(page, url, width, dark):
-    page.set_viewport_size({"width": width, "height": 900})
-    page.emulate_media(color_scheme="dark" if dark else "light")
-    page.goto(url)
-    assert page.errors == []
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    paper, ink = page.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
-    assert (paper == "rgb(20, 23, 27)") == dark
-    assert paper != ink
+    check_layout(page, url, width, dark)
 
 
 @pytest.mark.parametrize("name", ["protocol", "track", "training data"])

@@ -150,6 +150,7 @@ def test_results_that_are_not_audited_are_marked_and_not_added_to_a_leaderboard(
     assert "not audited" in render_leaderboard([row])
     audited = row.model_copy(update={"entry": "mine", "audited": 1, "rank": 1})
     assert "not audited" not in render_leaderboard([audited])
+    assert "not audited" not in render_leaderboard([audited.model_copy(update={"audited": 0})]), "not in the sample"
     assert "not audited" in render_leaderboard([audited, row])
     out = tmp_path / "rows.json"
     write_leaderboard(out, Leaderboard(rows=[audited]))

@@ -1,7 +1,7 @@
 """The page of a result in a browser: no overflow, no errors, and filters of the list."""
 
 import pytest
-from browser import open_page
+from browser import check_layout, open_page
 from synthetic_results import outcome, write
 
 from robocas_ms3.evaluation.report import PAGE, write_report
@@ -33,14 +33,7 @@ def url(tmp_path_factory):
 
 @pytest.mark.parametrize(("width", "dark"), [(420, True), (1440, False)])
 def test_page_has_no_errors_and_no_overflow(page, url, width, dark):
-    page.set_viewport_size({"width": width, "height": 900})
-    page.emulate_media(color_scheme="dark" if dark else "light")
-    page.goto(url)
-    assert page.errors == []
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    paper, ink = page.evaluate("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
-    assert (paper == "rgb(20, 23, 27)") == dark
-    assert paper != ink
+    check_layout(page, url, width, dark)
 
 
 def test_filters_of_failed_episodes(page, url):
