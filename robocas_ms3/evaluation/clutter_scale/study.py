@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.evaluation.clutter_scale.curves import SuccessCurve, fit_success_curve
-from robocas_ms3.evaluation.clutter_scale.features import FEATURES, make_features
+from robocas_ms3.evaluation.clutter_scale.features import FEATURES
 from robocas_ms3.evaluation.clutter_scale.item_response import (
     ClutterScale,
     compute_auc,
@@ -21,14 +21,11 @@ from robocas_ms3.evaluation.clutter_scale.item_response import (
     fit_clutter_scale,
 )
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales, write_scales
+from robocas_ms3.evaluation.clutter_scale.task_results import MIN_EPISODES, TaskResults, describe_policy, split_by_task
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.tables import describe_action_noise, name_policy
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
 
-FITTED_RATES = 0.1, 0.9  # success rates of the policies to which a scale is fitted
 MIN_POLICIES = 2
-MIN_EPISODES = 20  # of a policy to which a scale is fitted
 
 
 @dataclass(frozen=True)
@@ -101,33 +98,6 @@ class ClutterStudy:
         write_json(folder / "curves.json", _to_json({"tasks": content, "left_out": self.left_out}))
 
 
-@dataclass(frozen=True)
-class _TaskResults:
-    """Results of the policies that were evaluated in a task.
-
-    Attributes:
-        results: P results.
-        successes: (P, S) 1: success, 0: failure, NaN: not evaluated.
-        episodes: (S,) numbers of the episodes.
-        features: (S, F) features of the scenes.
-    """
-
-    results: list[Result]
-    successes: NDArray[np.float64]
-    episodes: NDArray[np.integer]
-    features: NDArray[np.float64]
-
-    def find_fitted(self) -> NDArray[np.bool_]:
-        """Return (P,) whether a scale can be fitted to each policy."""
-        counts, rates = (~np.isnan(self.successes)).sum(axis=1), np.nanmean(self.successes, axis=1)
-        return (counts >= MIN_EPISODES) & (rates >= FITTED_RATES[0]) & (rates <= FITTED_RATES[1])
-
-    def list_rates(self) -> dict[str, float]:
-        """Return the success rate of each policy by its name."""
-        rates = np.nanmean(self.successes, axis=1).tolist()
-        return {_name(result): rate for result, rate in zip(self.results, rates, strict=True)}
-
-
 def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool = False) -> ClutterStudy:
     """Place policies on the clutter scale of each task of a protocol.
 
@@ -146,13 +116,15 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
             raise EvaluationError("result of another protocol", where=result.folder, expected=expected, found=found)
     folders: dict[str, Path] = {}
     for result in results:
-        if (first := folders.setdefault(_name(result), result.folder)) != result.folder:
+        if (first := folders.setdefault(describe_policy(result), result.folder)) != result.folder:
             what, fix = "two results of the same policy", "Pass one of them."
-            raise EvaluationError(what, where=result.folder, expected=f"only {first}", found=_name(result), fix=fix)
+            raise EvaluationError(
+                what, where=result.folder, expected=f"only {first}", found=describe_policy(result), fix=fix
+            )
     fixed = None if fit else read_scales(protocol.folder / SCALE_FILE)
     tasks: dict[str, TaskStudy] = {}
     left_out: dict[str, dict[str, float]] = {}
-    for task, evaluated in _split_by_task(results, protocol).items():
+    for task, evaluated in split_by_task(results, protocol).items():
         fitted = evaluated.find_fitted()
         if fixed is not None and task in fixed:
             tasks[task] = _place_policies(evaluated, fixed[task].make_scale(), fixed[task].fitted)
@@ -177,60 +149,33 @@ def describe_rates(rates: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
 
 
-def _split_by_task(results: Sequence[Result], protocol: LoadedProtocol) -> dict[str, _TaskResults]:
-    """Return the results in each task, without policies and tasks that were not evaluated."""
-    features = make_features(read_difficulties_of(protocol))
-    successes = np.array([_read_successes(result, len(features)) for result in results])
-    tasks: dict[str, _TaskResults] = {}
-    for task in dict.fromkeys(episode.task for episode in protocol.episodes):
-        in_task = np.array([episode.task == task for episode in protocol.episodes])
-        episodes = np.flatnonzero(in_task & ~np.isnan(features).any(axis=1))
-        evaluated = np.flatnonzero((~np.isnan(successes[:, episodes])).any(axis=1))
-        if len(evaluated):
-            chosen = [results[number] for number in evaluated]
-            tasks[task] = _TaskResults(chosen, successes[np.ix_(evaluated, episodes)], episodes, features[episodes])
-    return tasks
-
-
-def _fit_task(task: _TaskResults, fitted: NDArray[np.bool_]) -> TaskStudy:
+def _fit_task(task: TaskResults, fitted: NDArray[np.bool_]) -> TaskStudy:
     """Fit the scale of a task to some of its policies, and place all policies on it."""
     scale = fit_clutter_scale(task.successes[fitted], task.features)
     areas = np.full(len(task.results), np.nan)
     areas[fitted] = compute_held_out_auc(task.successes[fitted], task.features)
-    names = [_name(task.results[number]) for number in np.flatnonzero(fitted)]
+    names = [describe_policy(task.results[number]) for number in np.flatnonzero(fitted)]
     return _place_policies(task, scale, names, areas)
 
 
 def _place_policies(
-    task: _TaskResults, scale: ClutterScale, fitted: list[str], areas: NDArray[np.float64] | None = None
+    task: TaskResults, scale: ClutterScale, fitted: list[str], areas: NDArray[np.float64] | None = None
 ) -> TaskStudy:
     difficulty = scale.compute_difficulty(task.features)
     if areas is None:
         areas = np.array([compute_auc(difficulty, row) for row in task.successes])
     policies = [
         PolicyOnScale(
-            _name(result), result.run.policy.track, _fit_curve(difficulty, row), None if np.isnan(area) else float(area)
+            describe_policy(result),
+            result.run.policy.track,
+            _fit_curve(difficulty, row),
+            None if np.isnan(area) else float(area),
         )
         for result, row, area in zip(task.results, task.successes, areas, strict=True)
     ]
     policies.sort(key=lambda policy: policy.curve.successes / policy.curve.episodes, reverse=True)
     weights = dict(zip(FEATURES, (scale.weights * task.features.std(axis=0)).tolist(), strict=True))
     return TaskStudy(scale, fitted, task.episodes, difficulty, weights, policies)
-
-
-def _read_successes(result: Result, count: int) -> NDArray[np.float64]:
-    row = np.full(count, np.nan)
-    for number, outcome in result.outcomes.items():
-        if number >= count:
-            what, expected = "an episode is not in the protocol", f"fewer than {count} episodes"
-            raise EvaluationError(what, where=result.folder, expected=expected, found=f"episode {number}")
-        row[number] = outcome.success and not outcome.error
-    return row
-
-
-def _name(result: Result) -> str:
-    noise = describe_action_noise(result.run)
-    return f"{name_policy(result.run)} with {noise}" if noise else name_policy(result.run)
 
 
 def _fit_curve(difficulty: NDArray[np.floating], row: NDArray[np.float64]) -> SuccessCurve:
