@@ -36,6 +36,7 @@ FILES = {
     "clutter-scale-v1/clutter_scale.json": "7f332ae5846ce023",
     "clutter-scale-v1/difficulty.jsonl": "4331de701a7dc78a",
     "removal-order-v1/difficulty.jsonl": "d104bfa6568c0345",
+    "removal-order-v1/questions.jsonl": "4346afe126bf3a3f",
 }
 
 
