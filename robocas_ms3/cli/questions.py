@@ -21,10 +21,10 @@ DESCRIPTION = "Questions about which object has to be removed first, for vision-
 class Make:
     """Write the questions about the scenes of a protocol, with images in which the objects have numbers.
 
-    A protocol with questions.jsonl has fixed questions. For another protocol, questions are made from difficulty.jsonl
-    in its folder (docs/difficulty.md). After an interruption, the same command continues.
+    removal-order-v1 has fixed questions. For a protocol without questions.jsonl, they are made from difficulty.jsonl in
+    its folder (docs/difficulty.md). After an interruption, the same command continues.
 
-    Example: robocas questions make clutter-scale-v1 --out questions
+    Example: robocas questions make removal-order-v1 --out questions
     """
 
     protocol: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROTOCOL")]
@@ -62,7 +62,7 @@ class AnswerQuestions:
     folders: Folders
     """Folders of results; shards of one evaluation count as one result."""
     questions: Annotated[str, tyro.conf.arg(metavar="QUESTIONS")]
-    """Folder of robocas questions make, or name of a bundled protocol with questions."""
+    """Folder of robocas questions make, or a bundled protocol with fixed questions: removal-order-v1."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.jsonl")]
     """File with the answers (JSON Lines)."""
     overwrite: bool = False
@@ -80,7 +80,7 @@ class Score:
     """
 
     questions: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="QUESTIONS")]
-    """Folder of robocas questions make, or name of a bundled protocol with questions."""
+    """Folder of robocas questions make, or a bundled protocol with fixed questions: removal-order-v1."""
     answers: Annotated[
         tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ANSWERS ...]", help_behavior_hint="")
     ] = ()
