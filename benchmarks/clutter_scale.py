@@ -36,7 +36,7 @@ from robocas_ms3.evaluation.clutter_scale.item_response import (
     fit_clutter_scale,
 )
 from robocas_ms3.evaluation.clutter_scale.task_results import TaskResults, describe_policy, split_by_task
-from robocas_ms3.evaluation.results import load_protocol_of
+from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
 FIRST, STEP = 20, 4  # scenes with which an adaptive evaluation begins, and that it adds before it fits again
 LIMITS = -20.0, 30.0  # of an interval: infinite ones are cut

@@ -35,8 +35,8 @@ from robocas_ms3.evaluation import (
     PolicySpec,
     load_protocol,
 )
-from robocas_ms3.evaluation.protocol import ProtocolEpisode
-from robocas_ms3.evaluation.rollout import run_rollouts
+from robocas_ms3.evaluation.protocols.protocol import ProtocolEpisode
+from robocas_ms3.evaluation.rollouts.rollout import run_rollouts
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.task_specs import TASKS
 

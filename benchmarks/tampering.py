@@ -33,13 +33,13 @@ import tyro
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.audit.run import find_audit_obstacle, run_audit
-from robocas_ms3.evaluation.outcomes import Checkpoints
 from robocas_ms3.evaluation.policies import open_policy
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, load_protocol_of, read_result
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.results.outcomes import Checkpoints
+from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, load_protocol_of, read_result
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions, write_actions, write_checkpoints
+from robocas_ms3.evaluation.results.verify import find_violations
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stored_episodes import hash_actions, write_actions, write_checkpoints
-from robocas_ms3.evaluation.verify import find_violations
 
 PROTOCOL = "smoke"
 PICK, OTHER_PICK, SEARCH = 0, 1, 4  # episodes of smoke

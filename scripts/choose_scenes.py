@@ -32,8 +32,8 @@ from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
-from robocas_ms3.evaluation.bundled_protocols import RULES
-from robocas_ms3.evaluation.protocol import (
+from robocas_ms3.evaluation.protocols.bundled_protocols import RULES
+from robocas_ms3.evaluation.protocols.protocol import (
     CONFIGS,
     EPISODES,
     LAYOUTS,
@@ -42,7 +42,7 @@ from robocas_ms3.evaluation.protocol import (
     ProtocolEpisode,
     load_protocol,
 )
-from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, read_difficulties_of
+from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES, read_difficulties_of
 from robocas_ms3.scenes.layout_table import join_frozen_layouts
 
 MOST_REMOVALS = 3  # scenes with more removals, or without a solution, are in the same group

@@ -28,7 +28,7 @@ LONGEST = {
     "tests/asset_tools/builtin/test_builtin_shapes.py",
     "tests/datasets/conversion/test_env_renderer.py",
     "tests/demos/test_generate.py",
-    "tests/evaluation/test_weld.py",
+    "tests/evaluation/rollouts/test_weld.py",
     "tests/examples/test_examples.py",
     "tests/plans/test_run_plan.py",
     "tests/tasks/test_registry.py",

@@ -113,8 +113,8 @@ def _measure_config(cfg: Difficulty, out: Path, bar: ProgressBar) -> Measurement
 
 def _measure_protocol(cfg: Difficulty, out: Path, bar: ProgressBar) -> Measurement:
     from robocas_ms3.core.errors import ConfigError
-    from robocas_ms3.evaluation.protocol import load_protocol
-    from robocas_ms3.evaluation.scene_difficulties import measure_protocol, read_measured
+    from robocas_ms3.evaluation.protocols.protocol import load_protocol
+    from robocas_ms3.evaluation.protocols.scene_difficulties import measure_protocol, read_measured
 
     given = {"--set": cfg.set, "--seeds": cfg.seeds, "--pack": cfg.pack != "builtin"}
     if refused := [option for option, value in given.items() if value]:

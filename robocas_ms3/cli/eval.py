@@ -61,13 +61,13 @@ def run(settings: EvaluationSettings) -> int:
     from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.policies import find_policy, open_policy
-    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.protocols.protocol import load_protocol
     from robocas_ms3.evaluation.report.tables import render_markdown
-    from robocas_ms3.evaluation.results import read_result
+    from robocas_ms3.evaluation.results.result_files import read_result
 
     find_policy(settings.policy)
     load_protocol(settings.protocol)
-    from robocas_ms3.evaluation.session import EvaluationSession
+    from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 
     use_one_torch_thread()
     count = 0
@@ -94,8 +94,8 @@ def run(settings: EvaluationSettings) -> int:
 def list_protocols(cfg: Protocols) -> int:
     from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.core.paths import protocols_dir
-    from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-    from robocas_ms3.evaluation.protocol import TRAIN, load_protocol
+    from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+    from robocas_ms3.evaluation.protocols.protocol import TRAIN, load_protocol
 
     protocols = [load_protocol(name) for name in bundled_protocols()]
     rows = [(one.rules.name, len(one.episodes), ", ".join(one.splits), one.description) for one in protocols]
@@ -113,8 +113,8 @@ def freeze(cfg: Freeze) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.output_folder import check_replaceable
-    from robocas_ms3.evaluation.freeze import freeze_protocol, read_protocol_source
-    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.protocols.freeze import freeze_protocol, read_protocol_source
+    from robocas_ms3.evaluation.protocols.protocol import load_protocol
 
     source = read_protocol_source(cfg.source)
     check_replaceable(cfg.out)

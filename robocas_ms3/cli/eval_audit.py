@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from robocas_ms3.evaluation.audit.run import AuditedEpisode, AuditPlan, AuditSummary
-    from robocas_ms3.evaluation.protocol import LoadedProtocol
-    from robocas_ms3.evaluation.results import Result
+    from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+    from robocas_ms3.evaluation.results.result_files import Result
 
 
 @dataclass(kw_only=True)
@@ -64,8 +64,8 @@ class Audit(ReplayOptions):
 def audit(cfg: Audit) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.audit.run import find_audit_obstacle
-    from robocas_ms3.evaluation.results import load_protocol_of, read_result
-    from robocas_ms3.evaluation.verify import find_violations
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of, read_result
+    from robocas_ms3.evaluation.results.verify import find_violations
 
     cfg.check()
     result = read_result(cfg.folder)
@@ -96,7 +96,7 @@ def replay_result(
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.audit.run import AuditSummary, list_other_processors, run_audit
-    from robocas_ms3.evaluation.run_record import hash_source
+    from robocas_ms3.evaluation.results.run_record import hash_source
 
     if models := list_other_processors(result):
         print_line(f"note: made on another model of processor, so contacts may diverge: {', '.join(models)}")

@@ -47,7 +47,7 @@ def clutter_scale(cfg: PlacePolicies) -> int:
     from robocas_ms3.evaluation.clutter_scale.figure import write_curves
     from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
     from robocas_ms3.evaluation.clutter_scale.study import describe_rates, make_study
-    from robocas_ms3.evaluation.results import load_protocol_of
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     results = read_evaluations(cfg.folders)
     study = make_study(results, load_protocol_of(results[0], cfg.protocol), fit=cfg.fit)

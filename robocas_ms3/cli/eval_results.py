@@ -12,8 +12,8 @@ from robocas_ms3.cli.options import Folders, Maybe
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
-    from robocas_ms3.evaluation.protocol import LoadedProtocol
-    from robocas_ms3.evaluation.results import Result
+    from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+    from robocas_ms3.evaluation.results.result_files import Result
 
 
 @dataclass
@@ -119,7 +119,7 @@ def report(cfg: Report) -> int:
 
 def merge(cfg: Merge) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.results import merge_results
+    from robocas_ms3.evaluation.results.result_files import merge_results
 
     _check_folders(cfg.folders)
     result = merge_results(cfg.folders, cfg.out, overwrite=cfg.overwrite)
@@ -131,7 +131,7 @@ def merge(cfg: Merge) -> int:
 def compare(cfg: Compare) -> int:
     from robocas_ms3.cli.terminal import print_text
     from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
-    from robocas_ms3.evaluation.results import group_partial_results, load_protocol_of, read_result
+    from robocas_ms3.evaluation.results.result_files import group_partial_results, load_protocol_of, read_result
 
     _check_folders(cfg.folders)
     groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else group_partial_results(cfg.folders)
@@ -186,8 +186,8 @@ def table(cfg: WriteTable) -> int:
 def verify(cfg: Verify) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.report.tables import name_measurement
-    from robocas_ms3.evaluation.results import load_protocol_of
-    from robocas_ms3.evaluation.verify import find_violations
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of
+    from robocas_ms3.evaluation.results.verify import find_violations
 
     result = read(cfg.folders)
     found = find_violations(result, load_protocol_of(result, cfg.protocol))
@@ -206,7 +206,7 @@ def videos(cfg: Videos) -> int:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
-    from robocas_ms3.evaluation.results import load_protocol_of
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     check_number("--count", cfg.count, 1)
     result = read((cfg.folder,))
@@ -252,7 +252,7 @@ def _check_folders(folders: tuple[Path, ...]) -> None:
 
 def read(folders: tuple[Path, ...]) -> Result:
     """Read the result in a folder, or in the folders of its partial results."""
-    from robocas_ms3.evaluation.results import read_result
+    from robocas_ms3.evaluation.results.result_files import read_result
 
     _check_folders(folders)
     return read_result(*folders)
@@ -260,7 +260,7 @@ def read(folders: tuple[Path, ...]) -> Result:
 
 def read_evaluations(folders: tuple[Path, ...]) -> list[Result]:
     """Read results; folders with equal settings are partial results of one evaluation."""
-    from robocas_ms3.evaluation.results import group_partial_results, read_result
+    from robocas_ms3.evaluation.results.result_files import group_partial_results, read_result
 
     _check_folders(folders)
     return [read_result(*parts) for parts in group_partial_results(folders)]
@@ -269,7 +269,7 @@ def read_evaluations(folders: tuple[Path, ...]) -> list[Result]:
 def _find_protocol(result: Result, given: str | None) -> LoadedProtocol | None:
     """Load the protocol of a result; None if it is not bundled and not given, or has other files."""
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.evaluation.results import load_protocol_of
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     try:
         loaded = load_protocol_of(result, given)

@@ -22,7 +22,7 @@ def main(settings: GenerateSettings) -> int:
 
     make_roll_in, weights = None, ""
     if settings.episode.after_policy:
-        from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in_policy
+        from robocas_ms3.evaluation.rollouts.policy_rollin import PolicyRollIn, check_roll_in_policy
 
         weights = check_roll_in_policy(settings.episode)
         make_roll_in = partial(PolicyRollIn, settings.episode)

@@ -70,7 +70,7 @@ def add(cfg: Add) -> int:
     from robocas_ms3.cli.eval_results import read
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.leaderboard.entries import find_card, write_result
-    from robocas_ms3.evaluation.results import load_protocol_of
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     result = read(cfg.folders)
     protocol = load_protocol_of(result, cfg.protocol)
@@ -127,7 +127,7 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
     from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit
     from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
-    from robocas_ms3.evaluation.results import load_protocol_of, read_result
+    from robocas_ms3.evaluation.results.result_files import load_protocol_of, read_result
 
     try:
         result = read_result(folder)

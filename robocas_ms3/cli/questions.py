@@ -92,7 +92,7 @@ def make(cfg: Make) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
-    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.protocols.protocol import load_protocol
     from robocas_ms3.evaluation.removal_questions.question_files import make_questions
 
     check_number("--jobs", cfg.jobs, 1)

@@ -44,7 +44,7 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
-    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.protocols.protocol import load_protocol
     from robocas_ms3.evaluation.remote.messages import LARGEST_BATCH
     from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles, strip_brackets
 

@@ -1,7 +1,7 @@
 """Expert interventions (DAgger): complete a task from the state in which a learned policy left it.
 
 The scripted policy stops the arm, opens the gripper unless it holds the target, retreats from objects that it touches,
-and does the task from there. Only this part is recorded. `evaluation.policy_rollin` runs the learned policy.
+and does the task from there. Only this part is recorded. `evaluation.rollouts.policy_rollin` runs the learned policy.
 """
 
 from __future__ import annotations

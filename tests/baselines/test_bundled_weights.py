@@ -16,9 +16,9 @@ from robocas_ms3.baselines.training.record import BUNDLED, CHECKPOINT, read_run
 from robocas_ms3.baselines.training.session import load_initial_weights
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.evaluation import session
 from robocas_ms3.evaluation.policies import make_policy
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.rollouts import session
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 

@@ -13,9 +13,9 @@ from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import AssetError, ConfigError, EvaluationError, PlanError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.paths import builtin_packs_dir
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results import result_files
 from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, SeedFiles, read_plan
 
 
@@ -40,12 +40,12 @@ def write_result(root):
         (Path.mkdir, "hulls.obj", lambda root: read_hulls(root / "hulls.obj"), AssetError),
         (copy_protocol, "configs/other.yaml", load_protocol, ConfigError),
         (copy_protocol, "episodes.jsonl", load_protocol, EvaluationError),
-        (write_result, results.RUN, results.read_result, EvaluationError),
-        (write_result, results.OUTCOMES, results.read_result, EvaluationError),
+        (write_result, result_files.RUN, result_files.read_result, EvaluationError),
+        (write_result, result_files.OUTCOMES, result_files.read_result, EvaluationError),
         (
             write_result,
             "actions/000000.npz",
-            lambda root: results.read_result(root).read_actions(0),
+            lambda root: result_files.read_result(root).read_actions(0),
             EvaluationError,
         ),
         (Path.mkdir, PLAN, read_plan, PlanError),

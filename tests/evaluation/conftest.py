@@ -6,7 +6,7 @@ import pytest
 from counting_env import CountingEnv
 from short_protocols import shorten
 
-from robocas_ms3.evaluation import session
+from robocas_ms3.evaluation.rollouts import session
 
 
 @pytest.fixture

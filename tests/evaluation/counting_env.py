@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.errors import VectorEnvCrashError
-from robocas_ms3.evaluation.metrics import SUMS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
+from robocas_ms3.evaluation.results.metrics import SUMS
+from robocas_ms3.evaluation.rollouts.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
 from robocas_ms3.robots.camera_models import CameraModel
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted")

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.evaluation import EpisodeSpec, EvaluationSettings, Observations, PolicySpec, load_protocol
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.outcomes import PAPER_STAGES, MovedObject, compute_order_score
 from robocas_ms3.evaluation.policy import CONVENTIONS, ROBOT_QUANTITIES
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.results.outcomes import PAPER_STAGES, MovedObject, compute_order_score
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs/evaluation.md").read_text(encoding="utf-8")
 

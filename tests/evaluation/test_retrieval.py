@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from robocas_ms3.evaluation.metrics import RetrievalTracker, find_objects_to_move
-from robocas_ms3.evaluation.outcomes import Retrieval
+from robocas_ms3.evaluation.results.metrics import RetrievalTracker, find_objects_to_move
+from robocas_ms3.evaluation.results.outcomes import Retrieval
 
 TARGET, LID, CUP, PEAR = range(4)
 NAMES = ("target", "lid", "cup", "pear")

@@ -9,14 +9,14 @@ import pytest
 from synthetic_results import actions_of, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.outcomes import EvaluatedEpisode
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe_policy
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
 from robocas_ms3.evaluation.report.comparison import compare_results
-from robocas_ms3.evaluation.rollout import Rollout
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.results.outcomes import EvaluatedEpisode
+from robocas_ms3.evaluation.results.result_files import append_episode, open_result, read_result
+from robocas_ms3.evaluation.rollouts.rollout import Rollout
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 HOSTILE = "\x1b]0;t\x07\x9b\u202e<script>alert(1)</script>|`a`\n[b](http://c)"
@@ -57,10 +57,10 @@ def test_descriptions_that_cannot_be_recorded_are_refused(description, key):
 def test_description_round_trips_and_does_not_rename_the_policy(tmp_path):
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
     run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).run_record
-    with results.open_result(tmp_path / "out", run):
-        results.append_episode(tmp_path / "out", EvaluatedEpisode(outcome(0), actions_of(outcome(0))))
-    assert results.read_result(tmp_path / "out").run.policy.name == "mine"
-    with results.open_result(tmp_path / "out", run) as done:  # the record equals the written record
+    with open_result(tmp_path / "out", run):
+        append_episode(tmp_path / "out", EvaluatedEpisode(outcome(0), actions_of(outcome(0))))
+    assert read_result(tmp_path / "out").run.policy.name == "mine"
+    with open_result(tmp_path / "out", run) as done:  # the record equals the written record
         assert list(done) == [0]
 
 
@@ -70,8 +70,8 @@ def test_error_text_of_a_policy_round_trips(tmp_path):
     made = Rollout(start, error=f"{HOSTILE}\udcff").make_outcome(episode, [])
     assert made.error.isprintable()
     write(tmp_path / "out", [])
-    results.append_episode(tmp_path / "out", EvaluatedEpisode(made, actions_of(made)))
-    assert asdict(results.read_result(tmp_path / "out").outcomes[0]) == asdict(made)
+    append_episode(tmp_path / "out", EvaluatedEpisode(made, actions_of(made)))
+    assert asdict(read_result(tmp_path / "out").outcomes[0]) == asdict(made)
 
 
 def test_reports_escape_texts(tmp_path):

@@ -11,9 +11,10 @@ from example_packages import PAGE, install, robocas
 from robocas_ms3.cli.list import list_all
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.core.extensions import Registry
-from robocas_ms3.evaluation import policies, results
+from robocas_ms3.evaluation import policies
 from robocas_ms3.evaluation.policies import POLICY_GROUP, make_policy
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import read_result
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def test_policy_is_evaluated_by_name(site, tmp_path):
     (line,) = [line for line in PAGE.splitlines() if line.startswith("robocas eval") and "descend" in line]
     command = line.replace("robocas eval", "eval").replace("smoke", str(protocol)).split()
     robocas(site, *command, "--backend", "processes", "--envs", 1, cwd=tmp_path)
-    result = results.read_result(tmp_path / "eval" / "descend")
+    result = read_result(tmp_path / "eval" / "descend")
     assert result.run.policy.name == "descend"
     assert result.run.policy.model_dump()["class"] == "my_policies:Descend"
     (outcome,) = result.outcomes.values()

@@ -170,15 +170,15 @@ def test_recording_without_the_package_is_an_error(recorded, tmp_path):
 
 @pytest.mark.slow
 def test_evaluation_uses_the_robot_of_the_protocol(site, tmp_path):
-    from robocas_ms3.evaluation import results
-    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.protocols.protocol import load_protocol
+    from robocas_ms3.evaluation.results.result_files import read_result
 
     protocol = shutil.copytree(load_protocol("smoke").folder, tmp_path / "protocol")
     with (protocol / "protocol.yaml").open("a") as rules:
         rules.write("robot: twin\n")
     words = ["--policy", "scripted", "--protocol", protocol, "--episodes", 1, "--out", tmp_path / "eval"]
     robocas(site, "eval", "pick", *words, "--backend", "processes", "--envs", 1)
-    (outcome,) = results.read_result(tmp_path / "eval").outcomes.values()
+    (outcome,) = read_result(tmp_path / "eval").outcomes.values()
     assert outcome.error == ""
     assert outcome.success
 

@@ -127,7 +127,7 @@ def test_metrics_without_a_basket(site):
         "-c",
         MAKE
         + """
-from robocas_ms3.evaluation.metrics import EpisodeMetrics
+from robocas_ms3.evaluation.results.metrics import EpisodeMetrics
 metrics = EpisodeMetrics(base)
 for _ in range(3):
     env.step(hold)

@@ -27,7 +27,7 @@ from faults import (
     write_row,
 )
 
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 
 pytestmark = pytest.mark.faults
 COMMANDS = ("generate", "convert", "plan run", "eval")

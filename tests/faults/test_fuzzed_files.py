@@ -46,13 +46,13 @@ from robocas_ms3.demos.generation import OUTPUT
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.trajectory_replay import RecordedEpisode
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results
 from robocas_ms3.evaluation.report.page import render_page
 from robocas_ms3.evaluation.report.tables import render_markdown
+from robocas_ms3.evaluation.results import result_files
 from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, WorkUnit, read_plan
 from robocas_ms3.plans.load import bundled_plans, load_plan
 from robocas_ms3.plans.status import read_status
@@ -261,11 +261,11 @@ def read_hull_file(root):
 
 
 def read_result(root):
-    found = results.read_result(root)
+    found = result_files.read_result(root)
     assert render_markdown(found)
     assert render_page(found)
     assert compare_results([found, found])
-    results.group_partial_results([root])
+    result_files.group_partial_results([root])
 
 
 def read_plan_folder(root):
@@ -319,9 +319,9 @@ CASES = [  # writer, file, reader, number of changed files, least number of erro
     (write_pack, "hulls.obj", read_hull_file, 40, 10),
     (write_pack, "annotations.npz", read_annotations, 80, 40),
     *((write_protocol, name, load_protocol, 30, 0) for name in ("protocol.yaml", "episodes.jsonl")),
-    (write_result, results.RUN, read_result, 40, 5),
-    (write_result, results.OUTCOMES, read_result, 40, 0),
-    (write_result, "actions/000000.npz", lambda root: results.read_result(root).read_actions(0), 80, 40),
+    (write_result, result_files.RUN, read_result, 40, 5),
+    (write_result, result_files.OUTCOMES, read_result, 40, 0),
+    (write_result, "actions/000000.npz", lambda root: result_files.read_result(root).read_actions(0), 80, 40),
     (write_published_rows, "rows.json", lambda root: read_leaderboard(root / "rows.json"), 60, 20),
     (write_plan, PLAN, read_plan_folder, 25, 5),
     *((write_plan, name, read_plan_folder, 20, 0) for name in (OUTCOMES, OUTCOME)),

@@ -1,6 +1,6 @@
 """Faults in worker processes of conversion and generation, with synthetic episodes: the fast tests of the suite.
 
-tests/plans/test_run_plan.py has such tests for plans, tests/evaluation/test_session.py for evaluation, and
+tests/plans/test_run_plan.py has such tests for plans, tests/evaluation/rollouts/test_session.py for evaluation, and
 tests/core/test_workers.py for worker pools. test_every_fault.py has those with real commands.
 """
 

@@ -15,8 +15,8 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import read_difficulties_of
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "choose_scenes.py"

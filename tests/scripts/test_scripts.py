@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.cli import main as cli
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
 from robocas_ms3.scenes.config import bundled_configs
 
 ROOT = Path(__file__).resolve().parents[2]

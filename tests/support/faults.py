@@ -27,7 +27,7 @@ from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
-from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.results.result_files import read_result
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,7 +102,7 @@ def content(command, out):
                 for seed, one in ((one["episode_seed"], one) for one in episodes)
             ]
     elif command.name == "eval":
-        found = [(number, one.reproducible_values()) for number, one in results.read_result(out).outcomes.items()]
+        found = [(number, one.reproducible_values()) for number, one in read_result(out).outcomes.items()]
     elif command.name == "convert":
         found = [(path.name, files_of(path)) for path in sorted(out.glob("episode_*"))]
     else:  # by seed: without a skipped seed, other episodes have other numbers, which scene.json contains

@@ -44,7 +44,8 @@ _PROGRAM = """
 import os, pickle, runpy, sys, types
 answers = os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)
-import robocas_ms3.cli.main, robocas_ms3.demos.generation, robocas_ms3.evaluation.session, robocas_ms3.tasks.base
+import robocas_ms3.cli.main, robocas_ms3.demos.generation, robocas_ms3.tasks.base
+import robocas_ms3.evaluation.rollouts.session
 
 def execute(words, folder, outputs):
     for stream in (1, 2):

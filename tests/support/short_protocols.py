@@ -5,8 +5,8 @@ from pathlib import Path
 
 import yaml
 
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.protocol import EPISODES, RULES
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import EPISODES, RULES
 
 
 def shorten(name: str, folder: Path, max_steps: int, episodes: int | None = None) -> Path:

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.evaluation.outcomes import Outcome, find_failure_stage
-from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, Result, read_result
-from robocas_ms3.evaluation.stored_episodes import hash_actions, write_actions
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results.outcomes import Outcome, find_failure_stage
+from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, Result, read_result
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions, write_actions
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
 RUN_OF = {

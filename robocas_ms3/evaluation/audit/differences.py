@@ -9,8 +9,8 @@ import numpy as np
 
 from robocas_ms3.core.output_folder import list_setting_changes
 from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
-from robocas_ms3.evaluation.checkpoints import StateDeviation
-from robocas_ms3.evaluation.outcomes import Checkpoints, Outcome
+from robocas_ms3.evaluation.results.checkpoints import StateDeviation
+from robocas_ms3.evaluation.results.outcomes import Checkpoints, Outcome
 
 # Tolerances of a replay from checkpoint to checkpoint; docs/evaluation.md has measurements.
 LARGEST_DEVIATION = StateDeviation(target=0.15, body=0.5, joint=0.1)

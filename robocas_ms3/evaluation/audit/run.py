@@ -24,17 +24,17 @@ from robocas_ms3.evaluation.audit.differences import (
     list_state_differences,
 )
 from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT, CheckpointEnv, StoredActionsPolicy
-from robocas_ms3.evaluation.outcomes import Count, EvaluatedEpisode
-from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.rollout import count_checkpoint_steps
-from robocas_ms3.evaluation.run_record import (
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol, ProtocolEpisode
+from robocas_ms3.evaluation.results.outcomes import Count, EvaluatedEpisode
+from robocas_ms3.evaluation.results.result_files import Result
+from robocas_ms3.evaluation.results.run_record import (
     describe_machine,
     get_package_versions,
     hash_source,
     is_same_processor,
 )
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.rollouts.rollout import count_checkpoint_steps
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 OUTPUT = FolderKind("robocas eval audit", ("audit.json",), "result_hash")

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PolicyError
-from robocas_ms3.evaluation.checkpoints import StateDeviation
-from robocas_ms3.evaluation.outcomes import Checkpoints
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results.checkpoints import StateDeviation
+from robocas_ms3.evaluation.results.outcomes import Checkpoints
+from robocas_ms3.evaluation.results.result_files import Result
 
 RESTORE_TOLERANCE = 0.005
 """Deviation from a checkpoint in m or rad up to which the state is not restored."""

@@ -22,8 +22,8 @@ from robocas_ms3.evaluation.clutter_scale.item_response import (
 )
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales, write_scales
 from robocas_ms3.evaluation.clutter_scale.task_results import MIN_EPISODES, TaskResults, describe_policy, split_by_task
-from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results.result_files import Result
 
 MIN_POLICIES = 2
 

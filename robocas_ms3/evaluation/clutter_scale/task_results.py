@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.clutter_scale.features import make_features
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import read_difficulties_of
 from robocas_ms3.evaluation.report.tables import describe_action_noise, name_policy
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
+from robocas_ms3.evaluation.results.result_files import Result
 
 FITTED_RATES = 0.1, 0.9  # success rates of the policies to which a scale is fitted
 MIN_EPISODES = 20  # of a policy to which a scale is fitted

@@ -13,7 +13,7 @@ from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.harness.proprioception import CALIBRATION_SHAPES, KEYS, WIDTHS, depth_key
 from robocas_ms3.evaluation.policy import CONVENTIONS, Calibration, PolicySpec, Reference
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 

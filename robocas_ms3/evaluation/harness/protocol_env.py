@@ -14,7 +14,6 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.proprioception import (
     CALIBRATION_SHAPES,
     WIDTHS,
@@ -23,10 +22,11 @@ from robocas_ms3.evaluation.harness.proprioception import (
     depth_key,
     intrinsics_key,
 )
-from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, Observations, PolicySpec
-from robocas_ms3.evaluation.rollout import CameraObservations
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.results.outcomes import Outcome
+from robocas_ms3.evaluation.results.result_files import append_episode, open_result
+from robocas_ms3.evaluation.rollouts.rollout import CameraObservations
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
@@ -63,7 +63,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._folder, self._recorded = settings.out, set[int]()  # episodes that were written
         if (folder := settings.out) is not None:
             with ExitStack() as lock:
-                if lock.enter_context(results.open_result(folder, self._session.run_record)):
+                if lock.enter_context(open_result(folder, self._session.run_record)):
                     what, fix = "the output folder already has a result", "Choose another folder, or delete this one."
                     raise EvaluationError(what, where=folder, fix=fix)
                 self._lock = lock.pop_all()  # held until `close`
@@ -168,7 +168,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             evaluated = self._session.evaluated[env]
             number = evaluated.outcome.episode
             if self._folder is not None and number not in self._recorded:
-                results.append_episode(self._folder, evaluated)
+                append_episode(self._folder, evaluated)
                 self._recorded.add(number)
 
     def _update_observations(self, envs: list[int], observations: Observations | None) -> None:

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
-from robocas_ms3.evaluation.outcomes import MEASURES, PAPER_STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
-from robocas_ms3.evaluation.protocol import ProtocolEpisode
+from robocas_ms3.evaluation.protocols.protocol import ProtocolEpisode
 from robocas_ms3.evaluation.remote.messages import parse_actions, parse_policy_spec
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.results.outcomes import MEASURES, PAPER_STAGES
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 # size and vla-eval's name of the rotation by convention

@@ -20,10 +20,10 @@ from robocas_ms3.core.files import atomic_file, atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
-from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import RUN, Result, write_outcomes
-from robocas_ms3.evaluation.stored_episodes import write_actions, write_checkpoints
-from robocas_ms3.evaluation.verify import find_violations
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results.result_files import RUN, Result, write_outcomes
+from robocas_ms3.evaluation.results.stored_episodes import write_actions, write_checkpoints
+from robocas_ms3.evaluation.results.verify import find_violations
 
 CARD = "README.md"
 """Name of the model card in an entry."""

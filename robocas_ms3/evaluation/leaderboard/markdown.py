@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.leaderboard.rows import SEEN, LeaderboardRow, Training, find_seen_row
-from robocas_ms3.evaluation.outcomes import PAPER_STAGES
+from robocas_ms3.evaluation.results.outcomes import PAPER_STAGES
 from robocas_ms3.evaluation.statistics import compute_unpaired_interval
 
 _HEADS = (

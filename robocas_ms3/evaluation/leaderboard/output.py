@@ -25,8 +25,8 @@ from robocas_ms3.evaluation.leaderboard.rows import (
     sort_rows,
     write_leaderboard,
 )
-from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results.result_files import Result
 
 PAGE, MARKDOWN, ROWS = "index.html", "results.md", "results.json"
 

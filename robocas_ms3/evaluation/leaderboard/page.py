@@ -19,7 +19,7 @@ from robocas_ms3.evaluation.leaderboard.markdown import (
 from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow, Training
 from robocas_ms3.evaluation.report.html import render_document, render_rate_bar, render_section, render_table
 from robocas_ms3.evaluation.report.page import VIDEOS, render_stages
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.statistics import compute_success_rate
 
 NOTE = (

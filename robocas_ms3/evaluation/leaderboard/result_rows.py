@@ -8,12 +8,12 @@ from typing import Any
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow
-from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policies import POLICIES
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import describe_action_noise, get_stage_names
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.run_record import RunRecord
+from robocas_ms3.evaluation.results.outcomes import Outcome
+from robocas_ms3.evaluation.results.result_files import Result
+from robocas_ms3.evaluation.results.run_record import RunRecord
 
 _DIGITS = 4  # of rates
 

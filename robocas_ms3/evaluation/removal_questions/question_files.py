@@ -27,11 +27,11 @@ from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.images.png import encode_png
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.demos.recordings.trajectory_json import package_versions
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode, load_protocol
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol, ProtocolEpisode, load_protocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import read_difficulties_of
 from robocas_ms3.evaluation.removal_questions.records import RemovalQuestion
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
+from robocas_ms3.evaluation.results.result_files import Result
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.removal_questions.question_renderer import QuestionRenderer

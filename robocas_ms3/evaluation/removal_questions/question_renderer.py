@@ -16,7 +16,7 @@ from robocas_ms3.datasets.images.image_files import ImageOptions, compute_boundi
 from robocas_ms3.datasets.sources.episode_source import FIRST_SLOT
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.demos.recordings.environment import RecordedEnv
-from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.removal_questions.marks import draw_numbers
 from robocas_ms3.evaluation.removal_questions.records import (
     NumberedObject,

@@ -11,8 +11,8 @@ import numpy as np
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.images.image_files import Box
-from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.removal_questions.records import Answer, RemovalQuestion
+from robocas_ms3.evaluation.results.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.core.text import escape_controls
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.page import render_page
 from robocas_ms3.evaluation.report.tables import render_markdown
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results.result_files import Result
 
 MARKDOWN, PAGE, PARQUET = "report.md", "report.html", "episodes.parquet"
 _COLUMNS = {

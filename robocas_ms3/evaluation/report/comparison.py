@@ -8,9 +8,9 @@ from itertools import combinations
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import escape_markdown, format_count
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import describe_action_noise, name_measurement, name_policy
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.statistics import Comparison, adjust_p_values, compare_successes, make_power_warning
 
 _ALPHA = 0.05

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from robocas_ms3.core.text import format_count
-from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.html import (
     render_document,
     render_list,
@@ -33,7 +32,8 @@ from robocas_ms3.evaluation.report.tables import (
     make_title,
     mean,
 )
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results.outcomes import Outcome
+from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
 VIDEOS = "videos"

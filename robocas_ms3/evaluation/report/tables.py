@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from robocas_ms3.core.text import escape_markdown, format_count
-from robocas_ms3.evaluation.outcomes import PAPER_STAGES, Outcome
-from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.run_record import RunRecord
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results.outcomes import PAPER_STAGES, Outcome
+from robocas_ms3.evaluation.results.result_files import Result
+from robocas_ms3.evaluation.results.run_record import RunRecord
 from robocas_ms3.evaluation.statistics import SuccessRate, bin_success_rates
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 from robocas_ms3.scenes.task_specs import TASKS

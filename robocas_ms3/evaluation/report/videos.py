@@ -15,10 +15,10 @@ from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.datasets.images.video import open_video
 from robocas_ms3.evaluation.policy import Policy
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.page import VIDEOS, video_file_name
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.results.result_files import Result
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 SIZE = (480, 360)  # pixels

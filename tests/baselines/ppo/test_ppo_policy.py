@@ -11,8 +11,8 @@ from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import expand_action
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.action_wrapper import choose_control_mode
 from robocas_ms3.evaluation.policy import CONVENTIONS
+from robocas_ms3.evaluation.rollouts.action_wrapper import choose_control_mode
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
 FACTS = {"observation_size": 12 + 7 + 1 + 4, "action_size": 5, "rate_hz": 5}

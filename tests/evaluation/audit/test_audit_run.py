@@ -12,7 +12,6 @@ from robocas_ms3.cli import leaderboard
 from robocas_ms3.cli.eval_audit import Audit, audit
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
-from robocas_ms3.evaluation import session
 from robocas_ms3.evaluation.audit.run import (
     bound_differing_episodes,
     choose_episodes,
@@ -23,13 +22,14 @@ from robocas_ms3.evaluation.audit.run import (
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.report import videos
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions, write_actions, write_checkpoints
+from robocas_ms3.evaluation.results.verify import find_violations
+from robocas_ms3.evaluation.rollouts import session
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stored_episodes import hash_actions, write_actions, write_checkpoints
-from robocas_ms3.evaluation.verify import find_violations
 
 SMOKE = load_protocol("smoke")
 

@@ -12,8 +12,8 @@ from robocas_ms3.evaluation.audit.differences import (
     list_state_differences,
 )
 from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
-from robocas_ms3.evaluation.checkpoints import StateDeviation
-from robocas_ms3.evaluation.outcomes import NO_CHECKPOINTS, Checkpoints, MovedObject, Outcome, Retrieval
+from robocas_ms3.evaluation.results.checkpoints import StateDeviation
+from robocas_ms3.evaluation.results.outcomes import NO_CHECKPOINTS, Checkpoints, MovedObject, Outcome, Retrieval
 
 MOVED = [MovedObject("cup", 10, True, True), MovedObject("box", 12, True, True)]
 RECORDED = Outcome(

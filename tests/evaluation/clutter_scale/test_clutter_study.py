@@ -13,12 +13,12 @@ from synthetic_results import of_protocol, outcome, write
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
 from robocas_ms3.evaluation.clutter_scale.study import make_study
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import OUTCOMES, read_result
-from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES
+from robocas_ms3.evaluation.results.result_files import OUTCOMES, read_result
 
 ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
 

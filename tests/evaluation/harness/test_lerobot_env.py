@@ -21,8 +21,8 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from robocas_ms3.core.errors import EvaluationError, VectorEnvError
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.lerobot import RoboCASEnvConfig
+from robocas_ms3.evaluation.results.result_files import read_result
 
 HUB_FILE = Path(__file__).resolve().parents[3] / "examples" / "lerobot_hub" / "env.py"
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -90,7 +90,7 @@ def test_lerobots_rollout_reads_success_tasks_and_ends(made, tmp_path):
     assert found["done"].tolist() == [[False, True, True, True, True], [False, False, False, False, True]]
     assert found["success"].tolist() == found["done"].tolist()
     assert found["reward"].sum(1).tolist() == [1.0, 1.0]
-    outcomes = results.read_result(tmp_path / "results" / "search").outcomes
+    outcomes = read_result(tmp_path / "results" / "search").outcomes
     assert {number: one.steps for number, one in outcomes.items()} == {4: 2, 5: 5}
     tasks = policy.seen[0]["task"]
     assert len(set(tasks)) == 2 and all(isinstance(task, str) for task in tasks)

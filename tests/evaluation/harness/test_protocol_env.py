@@ -12,11 +12,11 @@ from short_protocols import shorten
 from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.core.poses import from_wxyz
-from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import read_result
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 SMOKE = load_protocol("smoke")
@@ -130,7 +130,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
             while not env.step(act(1))[2].all():
                 pass
     env.close()
-    result = results.read_result(tmp_path / "result")
+    result = read_result(tmp_path / "result")
     assert sorted(result.outcomes) == [0, 1] and result.run.policy.name == "mine"
     assert all((result.read_actions(number) == np.tile(act(1), (5, 1))).all() for number in (0, 1))
     for _ in range(2):  # a refused environment does not keep the lock
@@ -180,7 +180,7 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
         done = terminated | truncated
     env.close()
     assert seen == policy.seen and truncated.all()
-    ours, theirs = (results.read_result(tmp_path / name).outcomes for name in ("ours", "theirs"))
+    ours, theirs = (read_result(tmp_path / name).outcomes for name in ("ours", "theirs"))
     assert {n: one.reproducible_values() for n, one in ours.items()} == {
         n: one.reproducible_values() for n, one in theirs.items()
     }

@@ -14,7 +14,7 @@ pytest.importorskip("msgpack")
 
 from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.evaluation.harness.vla_eval import RoboCAS
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 
 ACT = {"actions": np.array([1, 0, 0, 0, 0, 0, 1], np.float32)}
 

@@ -9,8 +9,8 @@ from synthetic_results import of_protocol
 from robocas_ms3.cli.leaderboard import Add, add
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.leaderboard import entries
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, read_result
 
 CONFIGS = {episode.config for episode in load_protocol("smoke").episodes}
 

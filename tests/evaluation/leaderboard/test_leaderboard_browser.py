@@ -7,8 +7,8 @@ from browser import check_layout, open_page
 
 from robocas_ms3.evaluation.leaderboard.entries import find_results
 from robocas_ms3.evaluation.leaderboard.output import PAGE, AuditedResult, write_leaderboard_page
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import read_result
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import read_result
 
 pytestmark = pytest.mark.slow
 ENTRIES = Path(__file__).resolve().parents[3] / "leaderboard"

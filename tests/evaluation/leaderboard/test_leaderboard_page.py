@@ -15,8 +15,8 @@ from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.output import PAGE, ROWS, AuditedResult, rank_rows, write_leaderboard_page
 from robocas_ms3.evaluation.leaderboard.page import video_folder
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import RUN, read_result
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import RUN, read_result
 
 SMOKE = load_protocol("smoke")
 

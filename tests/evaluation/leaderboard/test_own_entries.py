@@ -6,8 +6,8 @@ import pytest
 
 from robocas_ms3.baselines.training.record import BUNDLED
 from robocas_ms3.evaluation.leaderboard.entries import CARD, find_result_violations, find_results
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import read_result
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import read_result
 
 ENTRIES = Path(__file__).resolve().parents[3] / "leaderboard"
 

@@ -8,7 +8,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
 from robocas_ms3.evaluation.leaderboard.rows import Leaderboard, Training, read_leaderboard, write_leaderboard
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 
 TRAINED = {
     "name": "runs/mine",

@@ -11,10 +11,10 @@ import pytest
 from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.evaluation.policies.scripted import MAX_HURRY, ScriptedPolicy, sample_plan
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
+from robocas_ms3.evaluation.rollouts.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
+from robocas_ms3.evaluation.rollouts.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
 from robocas_ms3.tasks.vector import RoboCASVectorEnv
 
 CONFIG, SEED, MAX_STEPS = "pick_upstream_eval", 2, 150

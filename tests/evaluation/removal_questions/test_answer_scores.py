@@ -10,7 +10,6 @@ from question_examples import make_question, write_folder
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.outcomes import MovedObject, Retrieval
 from robocas_ms3.evaluation.removal_questions.question_files import check_protocol_of
 from robocas_ms3.evaluation.removal_questions.scores import (
     compute_chance,
@@ -19,6 +18,7 @@ from robocas_ms3.evaluation.removal_questions.scores import (
     score_answers,
     score_rules,
 )
+from robocas_ms3.evaluation.results.outcomes import MovedObject, Retrieval
 
 QUESTIONS = [
     make_question(0, [1, 2], objects=4, highest=1, scripted=2),  # chance 1/2, in the middle: 2

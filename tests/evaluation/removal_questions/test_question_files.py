@@ -15,11 +15,11 @@ from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.images.image_files import read_image
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES
 from robocas_ms3.evaluation.removal_questions.question_files import QUESTIONS, make_questions, read_questions
 from robocas_ms3.evaluation.removal_questions.question_renderer import SIZE
-from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES
 
 PICK, OTHER_PICK = 0, 1  # episodes of the protocol smoke
 

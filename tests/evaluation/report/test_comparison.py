@@ -6,8 +6,8 @@ import pytest
 from synthetic_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.protocol import EPISODES, load_protocol
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import EPISODES, load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
 from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.evaluation.statistics import adjust_p_values, mcnemar_p_value

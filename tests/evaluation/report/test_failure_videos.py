@@ -11,7 +11,7 @@ from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.report.videos import SIZE, choose_episodes, record_videos
 from robocas_ms3.evaluation.settings import EvaluationSettings
 

@@ -12,7 +12,7 @@ from synthetic_results import of_protocol, outcome, write
 
 from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare, merge, report, verify
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
 from robocas_ms3.evaluation.report.page import render_page, video_file_name
 

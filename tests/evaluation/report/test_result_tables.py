@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from synthetic_results import outcome, write
 
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.report.tables import render_markdown
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.evaluation.freeze import read_protocol_source
+from robocas_ms3.evaluation.protocols.freeze import read_protocol_source
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.config import load_task_config
 

@@ -7,7 +7,7 @@ import yaml
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.evaluation.freeze import ProtocolSource
+from robocas_ms3.evaluation.protocols.freeze import ProtocolSource
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.config.compose import parse_set_option
 

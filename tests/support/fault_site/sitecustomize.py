@@ -24,7 +24,11 @@ POINTS = {  # module -> (class, method, function that returns the key of a task)
     "robocas_ms3.demos.generation": ("_EpisodeWorker", "run", lambda seed: seed),
     "robocas_ms3.datasets.conversion.workers": ("_EpisodeWorker", "run", lambda task: task[0]),
     "robocas_ms3.plans.worker": ("Recorder", "run", lambda files: files.seed),
-    "robocas_ms3.evaluation.action_wrapper": ("PolicyActionWrapper", "reset", lambda seed=None, **_: int(seed or 0)),
+    "robocas_ms3.evaluation.rollouts.action_wrapper": (
+        "PolicyActionWrapper",
+        "reset",
+        lambda seed=None, **_: int(seed or 0),
+    ),
 }
 
 

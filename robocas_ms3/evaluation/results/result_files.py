@@ -27,19 +27,19 @@ from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.outcomes import Checkpoints, EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
-from robocas_ms3.evaluation.protocol import LoadedProtocol, load_protocol
-from robocas_ms3.evaluation.run_record import MergedFolder, RunRecord
-from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
-from robocas_ms3.evaluation.stored_episodes import (
+from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol, load_protocol
+from robocas_ms3.evaluation.results.outcomes import Checkpoints, EvaluatedEpisode, Outcome
+from robocas_ms3.evaluation.results.run_record import MergedFolder, RunRecord
+from robocas_ms3.evaluation.results.stored_episodes import (
     delete_other_episodes,
     read_actions,
     read_checkpoints,
     write_actions,
     write_checkpoints,
 )
+from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _NO_RESULT = "invalid evaluation result"

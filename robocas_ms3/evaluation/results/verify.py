@@ -12,11 +12,11 @@ from pydantic import TypeAdapter, ValidationError
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import validate_json
 from robocas_ms3.core.text import format_count
-from robocas_ms3.evaluation.outcomes import MEASURES, Outcome, compute_order_score, find_failure_stage
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, Protocol, ProtocolEpisode
-from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.run_record import RunRecord
+from robocas_ms3.evaluation.protocols.protocol import DEFAULT_HZ, LoadedProtocol, Protocol, ProtocolEpisode
+from robocas_ms3.evaluation.results.outcomes import MEASURES, Outcome, compute_order_score, find_failure_stage
+from robocas_ms3.evaluation.results.result_files import Result
+from robocas_ms3.evaluation.results.run_record import RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
 # Flags of the built-in tasks. Custom tasks may have other stages.

@@ -7,8 +7,8 @@ import pytest
 from synthetic_results import RUN_OF, actions_of, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
-from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, find_failure_stage
-from robocas_ms3.evaluation.results import (
+from robocas_ms3.evaluation.results.outcomes import EvaluatedEpisode, find_failure_stage
+from robocas_ms3.evaluation.results.result_files import (
     OUTCOMES,
     RUN,
     append_episode,
@@ -17,8 +17,8 @@ from robocas_ms3.evaluation.results import (
     open_result,
     read_result,
 )
-from robocas_ms3.evaluation.run_record import RunRecord
-from robocas_ms3.evaluation.stored_episodes import hash_actions
+from robocas_ms3.evaluation.results.run_record import RunRecord
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 

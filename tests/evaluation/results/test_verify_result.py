@@ -13,10 +13,10 @@ from synthetic_results import of_protocol
 
 from robocas_ms3.cli.eval_results import Verify, verify
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation import verify as verify_module
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
-from robocas_ms3.evaluation.verify import find_violations
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results import verify as verify_module
+from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.results.verify import find_violations
 from robocas_ms3.scenes.task_specs import TASKS
 
 

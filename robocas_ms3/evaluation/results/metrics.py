@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from robocas_ms3.core.arrays import as_float32, as_tensor, known_all_false, maximum, norm, to_native, where
-from robocas_ms3.evaluation.outcomes import MEASURES
+from robocas_ms3.evaluation.results.outcomes import MEASURES
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import read_link_poses

@@ -24,7 +24,7 @@ from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.evaluation.policies.plain import NoopPolicy
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
-from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in_policy, sample_roll_in_steps
+from robocas_ms3.evaluation.rollouts.policy_rollin import PolicyRollIn, check_roll_in_policy, sample_roll_in_steps
 
 CONFIG = "pick_upstream_eval"
 

@@ -10,9 +10,9 @@ import yaml
 
 from robocas_ms3.cli.eval import Protocols, list_protocols
 from robocas_ms3.core.errors import ConfigError, EvaluationError
-from robocas_ms3.evaluation.bundled_protocols import DESCRIPTIONS, bundled_protocols
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import EPISODES, RULES, list_protocol_files, load_protocol
+from robocas_ms3.evaluation.protocols.bundled_protocols import DESCRIPTIONS, bundled_protocols
+from robocas_ms3.evaluation.protocols.protocol import EPISODES, RULES, list_protocol_files, load_protocol
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 

@@ -11,10 +11,10 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.checkpoints import StateDeviation, flatten_state, restore_checkpoint
-from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
-from robocas_ms3.evaluation.weld import Weld
+from robocas_ms3.evaluation.results.checkpoints import StateDeviation, flatten_state, restore_checkpoint
+from robocas_ms3.evaluation.results.metrics import EpisodeMetrics
+from robocas_ms3.evaluation.rollouts.weld import Weld
 from robocas_ms3.planning.action_noise import draw_noise
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 

@@ -18,15 +18,6 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import (
-    MOTION_STEPS,
-    V0_CONTROL_HZ,
-    PolicyActionWrapper,
-    check_action_noise_available,
-    make_env_kwargs,
-)
-from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.policy import (
     CONVENTIONS,
     EpisodeSpec,
@@ -36,8 +27,19 @@ from robocas_ms3.evaluation.policy import (
     describe_policy,
     forbid_policy_exit,
 )
-from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
-from robocas_ms3.evaluation.rollout import (
+from robocas_ms3.evaluation.protocols.protocol import ProtocolEpisode, load_protocol
+from robocas_ms3.evaluation.results.outcomes import EvaluatedEpisode, Outcome
+from robocas_ms3.evaluation.results.result_files import append_episode, open_result
+from robocas_ms3.evaluation.results.run_record import RunRecord, describe_machine, get_package_versions, hash_source
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions
+from robocas_ms3.evaluation.rollouts.action_wrapper import (
+    MOTION_STEPS,
+    V0_CONTROL_HZ,
+    PolicyActionWrapper,
+    check_action_noise_available,
+    make_env_kwargs,
+)
+from robocas_ms3.evaluation.rollouts.rollout import (
     NOT_FINITE,
     CameraObservations,
     EndConditions,
@@ -45,10 +47,8 @@ from robocas_ms3.evaluation.rollout import (
     Rollout,
     run_rollouts,
 )
-from robocas_ms3.evaluation.run_record import RunRecord, describe_machine, get_package_versions, hash_source
+from robocas_ms3.evaluation.rollouts.weld import check_weld_available
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stored_episodes import hash_actions
-from robocas_ms3.evaluation.weld import check_weld_available
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
@@ -133,14 +133,14 @@ class EvaluationSession:
             RobocasError: another process writes to the folder, or the folder was removed.
         """
         settings = self.settings
-        opened = results.open_result(
+        opened = open_result(
             self.folder, self.run_record, overwrite=settings.overwrite, retry_errors=settings.retry_errors
         )
         with closing(self), opened as done:
             missing = [episode for episode in self.episodes if episode.episode not in done]
             on_start(len(missing))
             for evaluated in self.run_episodes(missing):
-                results.append_episode(self.folder, evaluated)
+                append_episode(self.folder, evaluated)
                 yield evaluated.outcome
 
     def max_steps(self, task: str) -> int:

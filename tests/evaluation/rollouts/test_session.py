@@ -11,13 +11,14 @@ from counting_env import BREAKS, CountingEnv, CrashingEnv
 
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, VectorEnvCrashError
-from robocas_ms3.evaluation import results, session
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import read_result
+from robocas_ms3.evaluation.results.verify import find_violations
+from robocas_ms3.evaluation.rollouts import session
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.verify import find_violations
 
 SMOKE = load_protocol("smoke")
 AT_5_HZ = PolicySpec(rate_hz=5)
@@ -175,7 +176,7 @@ def test_select_runs_in_the_episodes_of_pick_in_paper_v1_and_the_result_records_
     assert evaluation.make_episode_spec(evaluation.episodes[0]).task == "pick"
     assert evaluation.folder == tmp_path / "eval" / "paper-v1" / "noop_select"
     assert {outcome.task for outcome in evaluation.run()} == {"select"}
-    result = results.read_result(evaluation.folder)
+    result = read_result(evaluation.folder)
     assert result.run.played_as == {"select": "pick"}
     assert find_violations(result, evaluation.protocol) == ["398 of 400 episodes missing"]
     with pytest.raises(OutputExistsError, match="played_as"):
@@ -206,7 +207,7 @@ def make_session(folder, policy="random", **settings) -> EvaluationSession:
 
 def evaluate(folder, policy="random", **settings) -> dict[int, dict]:
     list(make_session(folder, policy, **settings).run())
-    return {number: one.reproducible_values() for number, one in results.read_result(folder).outcomes.items()}
+    return {number: one.reproducible_values() for number, one in read_result(folder).outcomes.items()}
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -230,7 +231,7 @@ def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(
         "episode 1: the worker process crashed: SIGSEGV; the episode is repeated once"
     ]
     assert all(env.closed for env in made)
-    result = results.read_result(out)
+    result = read_result(out)
     assert {number: len(result.read_actions(number)) for number in found} == {
         number: one["steps"] for number, one in found.items()
     }
@@ -241,7 +242,7 @@ def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(
     said = capsys.readouterr().out
     assert "\n4 of 8 episodes run, 4 already there; " in said and " of 8 succeeded\n" in said
     assert ("(the worker process crashed: SIGSEGV). Repeat with --retry-errors." in said) == (times == 2)
-    assert results.read_result(out).count_errors() == times - 1
+    assert read_result(out).count_errors() == times - 1
     assert cli([str(word) for word in command]) == times - 1
     assert "\nno episode run, 8 already there; " in capsys.readouterr().out
 
@@ -326,7 +327,7 @@ def test_scripted_policy_succeeds(tmp_path):
 
 @pytest.mark.slow
 def test_policy_of_the_docs_gets_the_declared_observations(short, tmp_path, monkeypatch, needs_renderer):
-    page = (Path(__file__).resolve().parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[3] / "docs" / "evaluation.md").read_text(encoding="utf-8")
     (program,) = (block.split("```")[0] for block in page.split("```python\n") if "class Descend" in block)
     program = program.replace("rate_hz=5,", "rate_hz=5, depth=True, state=True, language='text',")
     program = program.replace(

@@ -12,8 +12,8 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.evaluation.clutter_scale.features import make_features
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, measure_protocol, read_difficulties_of
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES, measure_protocol, read_difficulties_of
 
 GEOMETRY = ("seed", "target", "objects", "visible_fraction", "obstacles", "free_grasps", "fewest_blockers", "gap")
 

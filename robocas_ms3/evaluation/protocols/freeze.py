@@ -19,7 +19,7 @@ from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import EvaluationError, LayoutError
 from robocas_ms3.core.files import atomic_file, atomic_folder, make_folder
 from robocas_ms3.core.strict_model import MAX_NAME_BYTES, StrictModel, parse
-from robocas_ms3.evaluation.protocol import (
+from robocas_ms3.evaluation.protocols.protocol import (
     CONFIG_NAME,
     CONFIGS,
     EPISODES,

@@ -11,15 +11,15 @@ import sapien
 import torch
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, make_env_kwargs
-from robocas_ms3.evaluation.metrics import read_metric
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.metrics import read_metric
+from robocas_ms3.evaluation.results.result_files import read_result
+from robocas_ms3.evaluation.results.verify import find_violations
+from robocas_ms3.evaluation.rollouts.action_wrapper import PolicyActionWrapper, make_env_kwargs
+from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.verify import find_violations
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 OPEN, CLOSE = 1.0, 0.0
@@ -182,6 +182,6 @@ def test_evaluation_with_the_weld_counts_and_records_welds(tmp_path):
     settings = EvaluationSettings(("pick",), name, str(protocol.folder), folder, **settings)
     (outcome,) = EvaluationSession(make_policy(name), settings).run()
     assert outcome.success and outcome.measures["welds"] == 1
-    result = results.read_result(folder)
+    result = read_result(folder)
     assert result.run.weld
     assert find_violations(result, protocol) == ["399 of 400 episodes missing"]

@@ -20,11 +20,16 @@ from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.action_wrapper import MOTION_STEPS, V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
-from robocas_ms3.evaluation.protocol import check_cameras, load_protocol
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, run_rollouts
+from robocas_ms3.evaluation.protocols.protocol import check_cameras, load_protocol
+from robocas_ms3.evaluation.rollouts.action_wrapper import (
+    MOTION_STEPS,
+    V0_CONTROL_HZ,
+    PolicyActionWrapper,
+    make_env_kwargs,
+)
+from robocas_ms3.evaluation.rollouts.rollout import EndConditions, EpisodeBatch, run_rollouts
 from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS

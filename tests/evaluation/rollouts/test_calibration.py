@@ -9,10 +9,10 @@ import pytest
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, make_env_kwargs
-from robocas_ms3.evaluation.calibration import CameraCalibration
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch
+from robocas_ms3.evaluation.rollouts.action_wrapper import PolicyActionWrapper, make_env_kwargs
+from robocas_ms3.evaluation.rollouts.calibration import CameraCalibration
+from robocas_ms3.evaluation.rollouts.rollout import EndConditions, EpisodeBatch
 from robocas_ms3.robots.camera_models import CameraModel
 from robocas_ms3.tasks.vector import make_vec
 

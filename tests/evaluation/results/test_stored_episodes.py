@@ -12,10 +12,10 @@ from counting_env import CountingEnv, run_policy
 from synthetic_results import actions_of, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.outcomes import NO_CHECKPOINTS, Checkpoints
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
-from robocas_ms3.evaluation.results import read_result
-from robocas_ms3.evaluation.stored_episodes import (
+from robocas_ms3.evaluation.results.outcomes import NO_CHECKPOINTS, Checkpoints
+from robocas_ms3.evaluation.results.result_files import read_result
+from robocas_ms3.evaluation.results.stored_episodes import (
     delete_other_episodes,
     find_actions_file,
     find_checkpoints_file,

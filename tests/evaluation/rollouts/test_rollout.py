@@ -8,8 +8,8 @@ from counting_env import CountingEnv, run_policy
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
-from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, run_rollouts
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.rollouts.rollout import EndConditions, EpisodeBatch, run_rollouts
 
 
 class CountingPolicy:

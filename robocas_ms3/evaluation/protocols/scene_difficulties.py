@@ -15,7 +15,7 @@ from robocas_ms3.demos.difficulty.difficulty_file import (
     read_difficulties,
 )
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.scenes.config import load_task_config
 
 DIFFICULTIES = "difficulty.jsonl"

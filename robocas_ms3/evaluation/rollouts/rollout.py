@@ -12,17 +12,6 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.core.text import escape_controls
-from robocas_ms3.evaluation.action_wrapper import CHECKPOINT
-from robocas_ms3.evaluation.calibration import CameraCalibration
-from robocas_ms3.evaluation.metrics import read_metric
-from robocas_ms3.evaluation.outcomes import (
-    MEASURES,
-    NO_CHECKPOINTS,
-    Checkpoints,
-    Outcome,
-    Retrieval,
-    find_failure_stage,
-)
 from robocas_ms3.evaluation.policy import (
     CONVENTIONS,
     ROBOT_QUANTITIES,
@@ -37,7 +26,18 @@ from robocas_ms3.evaluation.policy import (
     forbid_policy_exit,
     get_class_name,
 )
-from robocas_ms3.evaluation.protocol import ProtocolEpisode
+from robocas_ms3.evaluation.protocols.protocol import ProtocolEpisode
+from robocas_ms3.evaluation.results.metrics import read_metric
+from robocas_ms3.evaluation.results.outcomes import (
+    MEASURES,
+    NO_CHECKPOINTS,
+    Checkpoints,
+    Outcome,
+    Retrieval,
+    find_failure_stage,
+)
+from robocas_ms3.evaluation.rollouts.action_wrapper import CHECKPOINT
+from robocas_ms3.evaluation.rollouts.calibration import CameraCalibration
 from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from robocas_ms3.evaluation.checkpoints import flatten_state
+from robocas_ms3.evaluation.results.checkpoints import flatten_state
 
 
 def test_a_state_is_a_row_per_env_in_the_order_of_its_entries():

@@ -13,9 +13,9 @@ from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import EvaluationError, VectorEnvError
-from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, make_env_kwargs
-from robocas_ms3.evaluation.metrics import read_metric
 from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.results.metrics import read_metric
+from robocas_ms3.evaluation.rollouts.action_wrapper import PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.tasks.vector import make_vec
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_npz
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import atomic_file
-from robocas_ms3.evaluation.outcomes import NO_CHECKPOINTS, Checkpoints, Outcome
+from robocas_ms3.evaluation.results.outcomes import NO_CHECKPOINTS, Checkpoints, Outcome
 
 ACTIONS = "actions"
 """Folder of the archives with actions in a result, and name of their array."""

@@ -6,8 +6,8 @@ import yaml
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import eval as command
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
-from robocas_ms3.evaluation.freeze import ProtocolSource, freeze_protocol, read_protocol_source
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocols.freeze import ProtocolSource, freeze_protocol, read_protocol_source
+from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 

@@ -29,8 +29,8 @@ from robocas_ms3.core.checks import MAX_SEED, parse_shard
 from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import MAX_NAME_BYTES, FileName, StrictModel, did_you_mean, parse, parse_json
-from robocas_ms3.evaluation.bundled_protocols import DESCRIPTIONS, RULES, bundled_protocols
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
+from robocas_ms3.evaluation.protocols.bundled_protocols import DESCRIPTIONS, RULES, bundled_protocols
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
