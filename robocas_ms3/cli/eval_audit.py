@@ -27,7 +27,7 @@ class ReplayOptions:
     sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Replay N episodes per result, chosen at random. Default: all with stored actions."""
     seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Random seed of --sample. Default: a number that nobody can predict; it is printed."""
+    """Random seed of --sample. Default: a random number, which is printed."""
     envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Number of environments that run at the same time. Default: one per CPU core."""
 
@@ -55,13 +55,15 @@ class Audit(ReplayOptions):
     protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
     """Protocol folder. Required if the protocol of the result is not bundled."""
     out: Maybe[Path] = None
-    """Folder of the audit. Default: audit/NAME in the working directory; NAME: name of the result folder."""
+    """Folder of the audit. Default: audit/FOLDER in the working directory; audit/NAME, with the name of FOLDER, if
+    FOLDER is elsewhere."""
     overwrite: bool = False
     """Delete an existing audit and start again. Default: continue it."""
 
 
 @resumable
 def audit(cfg: Audit) -> int:
+    from robocas_ms3.cli.eval_results import print_violations
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.audit.run import find_audit_obstacle
     from robocas_ms3.evaluation.results.result_files import load_protocol_of, read_result
@@ -71,14 +73,15 @@ def audit(cfg: Audit) -> int:
     result = read_result(cfg.folder)
     protocol = load_protocol_of(result, cfg.protocol)
     if violations := find_violations(result, protocol, is_complete=False):
-        for violation in violations:
-            print_line(violation)
+        print_violations(violations)
         print_line(f"{cfg.folder}: {format_count(len(violations), 'violation')}; no episode was replayed")
         return 1
     if obstacle := find_audit_obstacle(result):
         print_line(f"{cfg.folder}: cannot be audited: {obstacle}")
         return 1
-    out = cfg.out or Path("audit") / cfg.folder.absolute().name
+    folder, here = cfg.folder.resolve(), Path.cwd().resolve()
+    name = folder.relative_to(here) if folder.is_relative_to(here) else folder.name
+    out = cfg.out or Path("audit") / name
     summary = replay_result(result, protocol, out, cfg, overwrite=cfg.overwrite)
     return _print_summary(cfg.folder, result, protocol, summary)
 
@@ -138,8 +141,9 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
     if summary.with_tolerances:
         text = format_count(summary.with_tolerances, "episode")
         print_line(f"note: {text} diverged and were replayed from checkpoint to checkpoint, with tolerances")
+    earlier = f" ({plan.replayed_before} of them in an earlier run)" if plan.replayed_before else ""
     print_line(
-        f"{folder}: {count} of {format_count(total, 'episode')} replayed ({plan.replayed_before} of them earlier), "
+        f"{folder}: {count} of {format_count(total, 'episode')} replayed{earlier}, "
         f"of {len(protocol.episodes)} in the protocol"
     )
     if failed := result.count_errors():
@@ -151,7 +155,7 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
     if differing := sum(bool(one.differences) for one in summary.episodes):
         print_line(f"{differing} of {format_count(count, 'episode')} differ from the result")
         return 1
-    print_line("no differences beyond the tolerances" if summary.with_tolerances else "all equal the result")
+    print_line("no differences beyond the tolerances" if summary.with_tolerances else "all equal the recorded episodes")
     if count < plan.candidates:
         bound = bound_differing_episodes(count, plan.candidates)
         print_line(f"sample with seed {plan.seed}: at most {bound} of the {plan.candidates} differ (95 % confidence)")

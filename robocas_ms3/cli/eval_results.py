@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.results.result_files import Result
 
 
+SHOWN_VIOLATIONS = 20  # of a result; the others are counted
+
+
 @dataclass
 class Results:
     """Options of commands that read results."""
@@ -157,13 +160,17 @@ def table(cfg: WriteTable) -> int:
         sort_rows,
         write_leaderboard,
     )
+    from robocas_ms3.evaluation.results.verify import check_consistency
 
     if cfg.out.suffix != ".json":
         what, expected = "invalid name of the table", "a name that ends in .json"
         raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
-    measured = new = [
-        row for one in read_evaluations(cfg.folders) for row in make_rows(one, _find_protocol(one, cfg.protocol))
-    ]
+    measured = new = []
+    for result in read_evaluations(cfg.folders):
+        protocol = _find_protocol(result, cfg.protocol)
+        if protocol is not None:
+            check_consistency(result, protocol, stored=())
+        new += make_rows(result, protocol)
     if cfg.update and cfg.out.exists():
         earlier = read_leaderboard(cfg.out).rows
         if any(row.entry for row in earlier):
@@ -183,6 +190,16 @@ def table(cfg: WriteTable) -> int:
     return 0
 
 
+def print_violations(violations: list[str]) -> None:
+    """Print the first violations, and the number of the others."""
+    from robocas_ms3.cli.terminal import print_line
+
+    for violation in violations[:SHOWN_VIOLATIONS]:
+        print_line(violation)
+    if (others := len(violations) - SHOWN_VIOLATIONS) > 0:
+        print_line(f"and {format_count(others, 'other violation')}")
+
+
 def verify(cfg: Verify) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.report.tables import name_measurement
@@ -191,8 +208,7 @@ def verify(cfg: Verify) -> int:
 
     result = read(cfg.folders)
     found = find_violations(result, load_protocol_of(result, cfg.protocol))
-    for violation in found:
-        print_line(violation)
+    print_violations(found)
     if broken := result.count_errors():
         print_line(f"note: {format_count(broken, 'episode')} ended with an error and counted as failed")
     valid = f"{format_count(len(result.outcomes), 'episode')} of {name_measurement(result.run)}, no violations"

@@ -77,7 +77,7 @@ def add(cfg: Add) -> int:
     sample = write_result(result, protocol, cfg.out, card=cfg.card, overwrite=cfg.overwrite)
     print_line(f"wrote {cfg.out}: {format_count(len(result.outcomes), 'episode')}, actions of {len(sample)}")
     if not find_card(cfg.out).exists():
-        print_line(f"next: write the model card {find_card(cfg.out)}, or pass --card")
+        print_line(f"next: write the model card {find_card(cfg.out)}")
     return 0
 
 
@@ -88,7 +88,7 @@ def audit(cfg: AuditEntries) -> int:
     cfg.check()
     folders = list(dict.fromkeys(folder for entry in cfg.entries for folder in find_results(entry)))
     with tempfile.TemporaryDirectory() as cache:
-        audited = [_audit_result(folder, Path(cache), cfg) for folder in folders]
+        audited = _audit_results(folders, Path(cache), cfg)
     bad = audited.count(None)
     print_line(f"{format_count(len(folders), 'result')} checked, {bad} with problems")
     return 1 if bad else 0
@@ -98,13 +98,16 @@ def audit(cfg: AuditEntries) -> int:
 def build(cfg: Build) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
+    from robocas_ms3.core.errors import OutputExistsError
     from robocas_ms3.core.paths import cache_dir
     from robocas_ms3.evaluation.leaderboard.entries import find_results
     from robocas_ms3.evaluation.leaderboard.output import write_leaderboard_page
 
     cfg.check()
     check_number("--videos", cfg.videos, 0)
-    audited = [_audit_result(folder, cache_dir() / "audits", cfg) for folder in find_results(cfg.entries)]
+    if cfg.out.exists() and not cfg.out.is_dir():
+        raise OutputExistsError("the output is not a folder", where=cfg.out, fix="Choose another path.")
+    audited = _audit_results(find_results(cfg.entries), cache_dir() / "audits", cfg)
     results = [one for one in audited if one is not None]
     if bad := audited.count(None):
         print_line(f"{bad} of {format_count(len(audited), 'result')} with problems; nothing was written")
@@ -115,6 +118,16 @@ def build(cfg: Build) -> int:
     for path in write_leaderboard_page(results, cfg.out):
         print_line(f"wrote {path}")
     return 0
+
+
+def _audit_results(folders: list[Path], cache: Path, cfg: AuditEntries | Build) -> list[AuditedResult | None]:
+    from robocas_ms3.cli.terminal import print_line
+
+    audited = []
+    for number, folder in enumerate(folders, 1):
+        print_line(f"result {number} of {len(folders)}: {folder}")
+        audited.append(_audit_result(folder, cache, cfg))
+    return audited
 
 
 def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> AuditedResult | None:

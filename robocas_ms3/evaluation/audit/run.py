@@ -87,8 +87,11 @@ class AuditSummary:
     @property
     def differences(self) -> list[str]:
         """Return a text per difference."""
+        modes = {"exact": "", "checkpoints": " (from checkpoint to checkpoint)"}
         return [
-            f"episode {one.episode}, recorded -> replayed: {text}" for one in self.episodes for text in one.differences
+            f"episode {one.episode}, recorded -> replayed{modes[one.mode]}: {text}"
+            for one in self.episodes
+            for text in one.differences
         ]
 
     @property

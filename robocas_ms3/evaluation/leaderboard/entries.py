@@ -23,7 +23,7 @@ from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
 from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results.result_files import RUN, Result, write_outcomes
 from robocas_ms3.evaluation.results.stored_episodes import write_actions, write_checkpoints
-from robocas_ms3.evaluation.results.verify import find_violations
+from robocas_ms3.evaluation.results.verify import check_consistency, find_violations
 
 CARD = "README.md"
 """Name of the model card in an entry."""
@@ -115,10 +115,7 @@ def write_result(
         OutputExistsError: ``out`` exists, the entry has another model card, or the folder of the entry has no result,
             but a README.md.
     """
-    if violations := find_violations(result, protocol, is_complete=False):
-        what, fix = "the result has violations", "Run robocas eval verify to list all."
-        found = f"{format_count(len(violations), 'violation')}, the first: {violations[0]}"
-        raise EvaluationError(what, where=result.folder, found=found, fix=fix)
+    check_consistency(result, protocol)
     if missing := count_missing(result, protocol):
         what, fix = "the result lacks episodes of its configurations", "Evaluate all episodes."
         found = f"{format_count(missing, 'episode')} missing"

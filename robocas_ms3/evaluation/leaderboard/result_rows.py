@@ -15,7 +15,7 @@ from robocas_ms3.evaluation.results.outcomes import Outcome
 from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.results.run_record import RunRecord
 
-_DIGITS = 4  # of rates
+_DIGITS = 6  # of rates
 
 
 def make_rows(result: Result, protocol: LoadedProtocol | None = None) -> list[LeaderboardRow]:

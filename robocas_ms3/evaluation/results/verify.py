@@ -81,6 +81,14 @@ def find_violations(
     return found
 
 
+def check_consistency(result: Result, protocol: LoadedProtocol, *, stored: Collection[int] | None = None) -> None:
+    """Raise EvaluationError if a result, which may lack episodes, has violations (`find_violations`)."""
+    if violations := find_violations(result, protocol, is_complete=False, stored=stored):
+        what, fix = "the result has violations", "Run robocas eval verify to list all."
+        found = f"{format_count(len(violations), 'violation')}, the first: {violations[0]}"
+        raise EvaluationError(what, where=result.folder, found=found, fix=fix)
+
+
 def _find_spec_violations(spec: dict[str, Any]) -> list[str]:
     try:
         validate_json(_SPEC, json.dumps(spec))

@@ -28,8 +28,8 @@ RECORDED = Outcome(
     steps=100,
     seconds=5.0,
     failure_stage="",
-    flags={"success": 100, "fail": None, "obstacles_cleared": 50},
-    flag_seconds={"success": 5.0, "fail": None, "obstacles_cleared": 2.5},
+    flags={"success": 100, "fail": None, "obstacles_cleared": 50, "picked_any": 39},
+    flag_seconds={"success": 5.0, "fail": None, "obstacles_cleared": 2.5, "picked_any": 1.95},
     measures={"path_length": 1.0, "contact_impulse": 100.0, "disturbed_most": 2, "fallen": 0},
     retrieval=Retrieval(MOVED, ["cup", "box"], 0, 1.0),
 )
@@ -39,6 +39,10 @@ def at_end(step):
     """Return the recorded outcome with a success at a step."""
     flags, seconds = RECORDED.flags | {"success": step}, RECORDED.flag_seconds | {"success": step / 20}
     return replace(RECORDED, steps=step, seconds=step / 20, flags=flags, flag_seconds=seconds)
+
+
+def with_picked(step):
+    return replace(RECORDED, flags=RECORDED.flags | {"picked_any": step})
 
 
 def with_measures(**values):
@@ -64,6 +68,8 @@ def with_moved(*moved):
         (replace(at_end(101), success_v0=False), False),
         (replace(RECORDED, flags={**RECORDED.flags, "success": None}), True),
         (replace(RECORDED, flags={**RECORDED.flags, "fail": 100}), True),
+        (with_picked(18), False),  # an object that stays near the height of this stage
+        (with_picked(None), True),
         (with_measures(path_length=1.02), False),
         (with_measures(path_length=1.03), True),
         (with_measures(contact_impulse=76.0), False),

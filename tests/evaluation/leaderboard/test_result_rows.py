@@ -25,12 +25,12 @@ TRAINED = {
 
 
 def test_row_of_a_trained_policy(tmp_path):
-    # 1 of 4: the exact interval is 0.0063 to 0.8059; three episodes lifted an object, one never touched any
+    # 1 of 4: the exact interval is 0.006309 to 0.80588; three episodes lifted an object, one never touched any
     outcomes = [outcome(0), outcome(1, 6), outcome(2, 5), outcome(3, 0, error="no plan", failure_stage="error")]
     (row,) = make_rows(write(tmp_path / "a", outcomes, policy=TRAINED, training_differences={"table": []}))
     assert (row.policy, row.track, row.task, row.split) == ("runs/mine", "modular", "pick", "test")
     assert (row.n, row.n_protocol, row.successes, row.errors, row.rate) == (4, None, 1, 1, 0.25)
-    assert row.interval == (0.0063, 0.8059) and row.rate_v0 == 0.25
+    assert row.interval == (0.006309, 0.80588) and row.rate_v0 == 0.25
     assert row.stages == {
         "reached_any": 0.75,
         "picked_any": 0.75,
