@@ -12,6 +12,7 @@ from robocas_ms3.cli.options import Folders, Maybe
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
+    from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow
     from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results.result_files import Result
 
@@ -165,12 +166,13 @@ def table(cfg: WriteTable) -> int:
     if cfg.out.suffix != ".json":
         what, expected = "invalid name of the table", "a name that ends in .json"
         raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
-    measured = new = []
+    new: list[LeaderboardRow] = []
     for result in read_evaluations(cfg.folders):
         protocol = _find_protocol(result, cfg.protocol)
         if protocol is not None:
             check_consistency(result, protocol, stored=())
         new += make_rows(result, protocol)
+    measured = new
     if cfg.update and cfg.out.exists():
         earlier = read_leaderboard(cfg.out).rows
         if any(row.entry for row in earlier):

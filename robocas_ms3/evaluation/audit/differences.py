@@ -40,15 +40,10 @@ def list_large_differences(recorded: Outcome, replayed: Outcome, period: int) ->
         period: number of policy steps between checkpoints.
     """
     before, now = _list_values(recorded, replayed)
-    tolerances = {"steps": period, "seconds": LARGEST_DELAY}
-    if before["steps"] != now["steps"]:  # values after different last steps
+    tolerances = {"steps": period, "flags": period, "seconds": LARGEST_DELAY, "flag_seconds": LARGEST_DELAY}
+    if before["steps"] != now["steps"]:  # values after different last steps; the steps of the flags are compared
         now["success_v0"] = before["success_v0"]
-    for flags in ("flags", "flag_seconds"):
-        # an object may stay near the height or distance of a stage for long, so only whether it was reached is compared
-        for stage, old in before[flags].items():
-            if old is not None and now[flags].get(stage) is not None:
-                now[flags][stage] = old
-        # whether the target is cleared depends on small motions of the heap
+    for flags in ("flags", "flag_seconds"):  # whether the target is cleared depends on small motions of the heap
         now[flags]["obstacles_cleared"] = before[flags].get("obstacles_cleared")
     if before["failure_stage"] == "obstacles_cleared" or now["failure_stage"] == "obstacles_cleared":
         now["failure_stage"] = before["failure_stage"]

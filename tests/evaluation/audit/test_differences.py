@@ -68,7 +68,8 @@ def with_moved(*moved):
         (replace(at_end(101), success_v0=False), False),
         (replace(RECORDED, flags={**RECORDED.flags, "success": None}), True),
         (replace(RECORDED, flags={**RECORDED.flags, "fail": 100}), True),
-        (with_picked(18), False),  # an object that stays near the height of this stage
+        (with_picked(19), False),
+        (with_picked(18), True),
         (with_picked(None), True),
         (with_measures(path_length=1.02), False),
         (with_measures(path_length=1.03), True),

@@ -6,7 +6,7 @@ import shutil
 import pytest
 from synthetic_results import of_protocol
 
-from robocas_ms3.cli.leaderboard import Add, add
+from robocas_ms3.cli.leaderboard import Add, Build, add, build
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.protocols.protocol import load_protocol
@@ -112,3 +112,13 @@ def test_a_result_that_gives_no_rows_is_a_violation(result, tmp_path):
     (out / RUN).write_text(json.dumps(record | {"policy": record["policy"] | {"parameters": "12M"}}))
     (violation,) = entries.find_result_violations(read_result(out), protocol)
     assert "parameters" in violation
+
+
+def test_a_page_whose_output_is_a_file_is_refused_before_any_replay(result, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    out.write_text("mine")
+    add(Add((result.folder,), out=tmp_path / "entries" / "mine" / "smoke"))
+    capsys.readouterr()
+    with pytest.raises(OutputExistsError):
+        build(Build(tmp_path / "entries", out=out))
+    assert out.read_text() == "mine" and capsys.readouterr().out == ""

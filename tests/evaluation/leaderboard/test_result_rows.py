@@ -1,7 +1,9 @@
 """Rows of the leaderboard from synthetic results, with numbers computed by hand."""
 
+import json
+
 import pytest
-from synthetic_results import outcome, write
+from synthetic_results import of_protocol, outcome, write
 
 from robocas_ms3.cli.eval_results import WriteTable, table
 from robocas_ms3.core.errors import EvaluationError
@@ -9,6 +11,7 @@ from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
 from robocas_ms3.evaluation.leaderboard.rows import Leaderboard, Training, read_leaderboard, write_leaderboard
 from robocas_ms3.evaluation.protocols.protocol import load_protocol
+from robocas_ms3.evaluation.results.result_files import OUTCOMES
 
 TRAINED = {
     "name": "runs/mine",
@@ -143,6 +146,19 @@ def test_command_writes_rows_of_all_results_and_the_published_ones(tmp_path, cap
         table(WriteTable((tmp_path / "a",), out=tmp_path / "board.txt"))
     with pytest.raises(EvaluationError):
         table(WriteTable((), out=out))
+
+
+def test_a_table_has_no_inconsistent_results(tmp_path):
+    result = of_protocol(tmp_path / "result", load_protocol("smoke"))
+    out = tmp_path / "rows.json"
+    assert table(WriteTable((result.folder,), out=out)) == 0
+    before, path = out.read_bytes(), result.folder / OUTCOMES
+    first, *others = path.read_text().splitlines(keepends=True)
+    changed = json.loads(first)
+    path.write_text(json.dumps({**changed, "success": not changed["success"]}) + "\n" + "".join(others))
+    with pytest.raises(EvaluationError):
+        table(WriteTable((result.folder,), out=out))
+    assert out.read_bytes() == before
 
 
 def test_results_that_are_not_audited_are_marked_and_not_added_to_a_leaderboard(tmp_path):
