@@ -78,7 +78,7 @@ def code() -> tuple[set[str], set[str], set[tuple[str, str]]]:
     pairs |= {("open_loop_check", f"{reason}{suffix}") for reason in deviations for suffix in ("", WITH_NOISE)}
     crashes = calls("ForkedProcessError", "ForkedProcessCrashError")
     pairs |= {("branch", reason) for call in crashes for reason in strings(call.args[0])}
-    for node in walk("evaluation", "policy_rollin.py"):
+    for node in walk("evaluation", "rollouts", "policy_rollin.py"):
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "reasons":
             assert isinstance(node.value, ast.Dict)
             pairs |= {("intervention", reason) for key in node.value.keys if key for reason in strings(key)}
