@@ -35,7 +35,8 @@ def flatten_state(state: Mapping[str, Any]) -> torch.Tensor:
 def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> StateDeviation:
     """Set poses and joint positions of a single env to those of a checkpoint if they are far from it.
 
-    Velocities, controllers, reached stages, metrics and the weld stay as they are.
+    Then stages that were reached, but not in the checkpoint, are not reached any more. Velocities, controllers, other
+    stages, metrics and the weld stay as they are.
 
     Args:
         base: the RoboCAS environment.
@@ -66,8 +67,20 @@ def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> S
     for name, jointed in target["articulations"].items():
         state["articulations"][name] = state["articulations"][name].clone()
         state["articulations"][name][:, _joint_positions(jointed)] = jointed[:, _joint_positions(jointed)]
+    stages = state["task"]["stages"]
+    state["task"]["stages"] = stages & _read_stages(base, checkpoint[present.shape[1] :])
     base.set_state_dict(state)
     return deviation
+
+
+def _read_stages(base: Any, extra: np.ndarray) -> torch.Tensor:
+    """Return the reached stages (1, stages) bool in the part of a checkpoint that is `RoboCASEnv.extra_state`."""
+    state, start = base.extra_state(), 0
+    for value in _list_values(state):
+        if value is state["task"]["stages"]:
+            return torch.from_numpy(extra[start : start + value.numel()])[None] > 0
+        start += value.numel()
+    raise AssertionError("unreachable")  # pragma: no cover
 
 
 def _list_values(state: Mapping[str, Any]) -> Iterator[torch.Tensor]:

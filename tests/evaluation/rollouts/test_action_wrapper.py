@@ -102,6 +102,27 @@ def test_poses_and_joints_return_to_a_checkpoint_but_velocities_do_not():
     assert (after[:bodies] != before).any()
 
 
+def test_stages_that_a_checkpoint_lacks_are_taken_back():
+    env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas"), "timed", checkpoints=True)
+    env.reset(seed=3)
+    *_, info = env.step(along(0.02))
+    checkpoint, base = info["checkpoint"][0].numpy(), env.unwrapped
+    stages: Any = base.success_check.stages
+    stages["picked_any"][:] = True
+    *_, info = env.step(along(0.02))
+    picked = info["checkpoint"][0].numpy()
+    stages["target_lifted"][:] = True
+    env.step(along(0.02))
+    env.restore_checkpoint(picked, 0.0)
+    assert stages["picked_any"].all() and not stages["target_lifted"].any()
+    env.restore_checkpoint(checkpoint, np.inf)  # only measures
+    assert stages["picked_any"].all()
+    env.restore_checkpoint(checkpoint, 0.0)
+    assert not stages["picked_any"].any()
+    env.restore_checkpoint(picked, 0.0)
+    assert not stages["picked_any"].any()  # only the simulation reaches a stage
+
+
 def qpos_in(base: Any, checkpoint: np.ndarray) -> np.ndarray:
     """Return the joint positions of the robot in a checkpoint."""
     row = torch.from_numpy(checkpoint)[None, : base.bodies.read().shape[1]]
