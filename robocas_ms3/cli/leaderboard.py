@@ -52,8 +52,8 @@ class AuditEntries(ReplayOptions):
 class Build(ReplayOptions):
     """Check and replay all entries, and write the leaderboard: index.html, results.md and results.json.
 
-    The stored actions are replayed as in `robocas leaderboard audit`. The cache folder keeps the outcomes. Nothing is
-    written if a result has problems (exit status 1).
+    The stored actions are replayed as in `robocas leaderboard audit`. The cache folder keeps the outcomes. If a result
+    has problems, nothing is written (exit status 1), unless --skip-failed leaves it out.
 
     Example: robocas leaderboard build leaderboard --out leaderboard-page
     """
@@ -64,6 +64,8 @@ class Build(ReplayOptions):
     """Output folder."""
     videos: int = 0
     """Number of videos of failed episodes per result, made from the stored actions."""
+    skip_failed: bool = False
+    """Leave out results with problems. The page names them."""
 
 
 def add(cfg: Add) -> int:
@@ -100,22 +102,28 @@ def build(cfg: Build) -> int:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.errors import OutputExistsError
     from robocas_ms3.core.paths import cache_dir
-    from robocas_ms3.evaluation.leaderboard.entries import find_results
+    from robocas_ms3.evaluation.leaderboard.entries import find_results, get_entry_name
     from robocas_ms3.evaluation.leaderboard.output import write_leaderboard_page
 
     cfg.check()
     check_number("--videos", cfg.videos, 0)
     if cfg.out.exists() and not cfg.out.is_dir():
         raise OutputExistsError("the output is not a folder", where=cfg.out, fix="Choose another path.")
-    audited = _audit_results(find_results(cfg.entries), cache_dir() / "audits", cfg)
+    folders = find_results(cfg.entries)
+    audited = _audit_results(folders, cache_dir() / "audits", cfg)
     results = [one for one in audited if one is not None]
-    if bad := audited.count(None):
-        print_line(f"{bad} of {format_count(len(audited), 'result')} with problems; nothing was written")
-        return 1
+    bad = [
+        f"{get_entry_name(folder)}/{folder.name}" for folder, one in zip(folders, audited, strict=True) if one is None
+    ]
+    if bad:
+        what = "left out" if cfg.skip_failed else "nothing was written. --skip-failed leaves these results out"
+        print_line(f"{len(bad)} of {format_count(len(audited), 'result')} with problems; {what}: {', '.join(bad)}")
+        if not cfg.skip_failed:
+            return 1
     if cfg.videos:
         for one in results:
             _record_videos(one, cfg)
-    for path in write_leaderboard_page(results, cfg.out):
+    for path in write_leaderboard_page(results, cfg.out, bad):
         print_line(f"wrote {path}")
     return 0
 

@@ -11,16 +11,16 @@ from robocas_ms3.evaluation.statistics import compute_unpaired_interval
 
 _HEADS = (
     *("policy", "track", "task", "split", "n", "success", "RoboCAS-v0's rule", *PAPER_STAGES),
-    *("training data", "trained here", "training", "parameters", "notes"),
+    *("training data", "training data matches", "training", "parameters", "notes"),
 )
 _CHANGE, _CHANGE_COLUMN = f"change from {SEEN}", _HEADS.index("success") + 1
 NOTE = (
     "Success: success rate in % with its exact 95 % interval. RoboCAS-v0's rule: success rate by the rule of "
-    "RoboCAS-v0 after the last step. Trained here: whether the training data has the task, scenes, objects and cameras "
-    "of the episodes; instructions are not compared. Change from seen: difference of the success rate from that of the "
-    "policy in the split seen, in percentage points, with Newcombe's 95 % interval for independent episodes; where "
-    "splits have equal scenes, robocas eval compare has the paired interval. Compare rows of the same table, task, "
-    "split and track, without notes."
+    "RoboCAS-v0 after the last step. Training data matches: whether the training data has the task, scenes, objects "
+    "and cameras of the episodes; instructions are not compared. Change from seen: difference of the success rate from "
+    "that of the policy in the split seen, in percentage points, with Newcombe's 95 % interval for independent "
+    "episodes; where splits have equal scenes, robocas eval compare has the paired interval. Compare rows of the same "
+    "table, task, split and track, without notes."
 )
 RANK_NOTE = (
     "Rank: 1 plus the number of policies of the same track, task, split and camera calibration with significantly "
@@ -41,9 +41,14 @@ PUBLISHED_NOTE = (
 )
 
 
-def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
-    """Return rows as Markdown: one table per protocol and its hash, and one table of published results."""
+def render_leaderboard(rows: Sequence[LeaderboardRow], left_out: Sequence[str] = ()) -> str:
+    """Return rows as Markdown: one table per protocol and its hash, and one table of published results.
+
+    ``left_out``: names of the results that are not in the rows because of a problem.
+    """
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
+    if left_out:
+        lines += ["", escape_markdown(describe_left_out(left_out))]
     if any(row.rank is not None for row in rows):
         lines += ["", RANK_NOTE]
     if any(not row.published and not row.entry for row in rows):
@@ -57,6 +62,11 @@ def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
     if published := [row for row in rows if row.published]:
         lines += ["", "## Published results", "", PUBLISHED_NOTE, "", *_render_table(published)]
     return "\n".join(lines) + "\n"
+
+
+def describe_left_out(names: Sequence[str]) -> str:
+    """Return a text that names results without an audit."""
+    return f"Left out, because the audit on this machine found a problem: {', '.join(names)}."
 
 
 def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:
@@ -85,7 +95,7 @@ def _make_cells(row: LeaderboardRow) -> list[str]:
         _format_percent(row.rate_v0),
         *(_format_percent(row.stages.get(stage)) for stage in PAPER_STAGES.values()),
         describe_data(training),
-        "" if row.trained_here is None else "yes" if row.trained_here else "no",
+        "" if row.training_matches is None else "yes" if row.training_matches else "no",
         describe_cost(training),
         "" if row.parameters is None else f"{row.parameters / 1e6:.2f} M",
         "; ".join(list_row_notes(row)),

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from markdown_it import MarkdownIt
+
 from robocas_ms3.evaluation.audit.run import hash_result
 from robocas_ms3.evaluation.leaderboard.entries import find_card, get_entry_name
 from robocas_ms3.evaluation.leaderboard.markdown import (
@@ -13,6 +15,7 @@ from robocas_ms3.evaluation.leaderboard.markdown import (
     RANK_NOTE,
     describe_cost,
     describe_data,
+    describe_left_out,
     format_audited,
     list_row_notes,
 )
@@ -27,27 +30,33 @@ NOTE = (
     "policy. An audit shows that the stored actions have these outcomes, but not which policy chose them."
 )
 _HEADS = (
-    *("protocol", "task", "split", "track", "rank#", "policy", "success#", "0 to 100 %", "n#", "p#", "audited#"),
-    *("trained here", "training data", "training", "parameters#", "notes"),
+    *("policy", "rank#", "success#", "0 to 100 %", "n#", "audited#", "p#", "protocol", "task", "split", "track"),
+    *("training data matches", "training data", "training", "parameters#", "notes"),
 )
-_FILTERS = ("protocol", "task", "split", "track", "policy", "trained here", "training data")
+_FILTERS = ("protocol", "task", "split", "track", "policy", "training data matches", "training data")
 
 
-def render_leaderboard_page(rows: Sequence[LeaderboardRow], results: Sequence[Result], folder: Path) -> str:
+def render_leaderboard_page(
+    rows: Sequence[LeaderboardRow], results: Sequence[Result], folder: Path, left_out: Sequence[str] = ()
+) -> str:
     """Return the leaderboard as an HTML page.
 
     Args:
         rows: rows in the order of the page.
-        results: results of the entries; each has a section with its stages.
+        results: results of the entries; each has its stages and its model card.
         folder: folder of the page; videos in `video_folder` are linked.
+        left_out: names of further results, which have a problem.
     """
     measured = [_render_row(row) for row in rows if not row.published]
     table = render_table(_HEADS, measured, "filtered")
+    empty = '<p id="empty" hidden>No rows match these filters.</p>\n'
+    note = f'<p class="note">{escape(describe_left_out(left_out))}</p>\n' if left_out else ""
     head = f'<span id="count">{len(measured)}</span> of {len(measured)} rows. {escape(NOTE, quote=False)}'
-    parts = [render_section("Results", head, _render_filters(measured) + table)]
-    parts += [_render_result(result, folder) for result in results]
+    parts = [render_section("Results", head, note + _render_filters(measured) + table + empty)]
+    entries = "".join(_render_result(result, rows, folder) for result in results)
+    parts.append(render_section("Entries", "Stages, videos and model card of each entry.", entries))
     if published := [row for row in rows if row.published]:
-        heads = ("policy", "track", "task", "success#")
+        heads = ("policy", "track", "task", "success by RoboCAS-v0's rule#")
         cells = [[escape(x) for x in (row.policy, row.track, row.task, _format_published(row))] for row in published]
         parts.append(
             render_section("Published results", escape(PUBLISHED_NOTE, quote=False), render_table(heads, cells))
@@ -65,24 +74,27 @@ def _render_filters(rows: Sequence[Sequence[str]]) -> str:
     labels = []
     for name in _FILTERS:
         column = _HEADS.index(name)
-        options = "".join(f"<option>{value}</option>" for value in sorted({row[column] for row in rows} - {""}))
+        values = {row[column].partition("<small>")[0] for row in rows} - {""}
+        options = "".join(f"<option>{value}</option>" for value in sorted(values))
         choices = f'<option value="">all</option>{options}'
-        labels.append(f'<label>{name} <select data-column="{column}">{choices}</select></label>\n')
+        selection = f'<select data-column="{column}" data-name="{name}">{choices}</select>'
+        labels.append(f"<label>{name} {selection}</label>\n")
     return f'<form class="filters">{"".join(labels)}</form>\n'
 
 
 def _render_row(row: LeaderboardRow) -> list[str]:
     training, rate = row.training or Training(), compute_success_rate(row.successes or 0, row.n or 1)
+    where = escape(", ".join((row.protocol, row.task, row.split)))
     return [
-        *map(escape, (row.protocol, row.task, row.split, row.track)),
+        f"{escape(row.name)}<small>{where}</small>",  # the small text is shown on small screens only
         "" if row.rank is None else str(row.rank),
-        escape(row.name),
         f"{100 * rate.rate:.1f} %<small>{100 * rate.low:.1f} to {100 * rate.high:.1f}</small>",
         render_rate_bar(rate, "good"),
         str(rate.n),
-        "" if row.rank_p_value is None else f"{row.rank_p_value:.2g}",
         format_audited(row),
-        "" if row.trained_here is None else "yes" if row.trained_here else "no",
+        "" if row.rank_p_value is None else f"{row.rank_p_value:.2g}",
+        *map(escape, (row.protocol, row.task, row.split, row.track)),
+        "" if row.training_matches is None else "yes" if row.training_matches else "no",
         escape(describe_data(training)),
         escape(describe_cost(training)),
         "" if row.parameters is None else f"{row.parameters / 1e6:.2f} M",
@@ -90,16 +102,23 @@ def _render_row(row: LeaderboardRow) -> list[str]:
     ]
 
 
-def _render_result(result: Result, folder: Path) -> str:
+def _render_result(result: Result, rows: Sequence[LeaderboardRow], folder: Path) -> str:
     """Return the stages of a result, links to its videos and the model card, folded."""
-    policy, protocol = get_entry_name(result.folder), result.run.protocol
+    entry, protocol = get_entry_name(result.folder), result.run.protocol
+    (policy,) = {row.name for row in rows if (row.entry, row.protocol) == (entry, protocol)} or {entry}
     videos = sorted(video_folder(folder, result).glob("*.mp4"))
     links = " ".join(f'<a href="{escape(one.relative_to(folder).as_posix())}">{one.stem}</a>' for one in videos)
     shown = f"<p>Videos of failed episodes: {links}</p>\n" if videos else ""
-    summary = f"<summary>{escape(policy)}, {escape(protocol)}</summary>"
+    summary = f"<summary>{escape(entry)}, {escape(protocol)}</summary>"
     card = find_card(result.folder)
-    text = f"<pre>{escape(card.read_text(encoding='utf-8', errors='replace'))}</pre>\n" if card.is_file() else ""
-    return f"<details>\n{summary}\n{render_stages(result)}{shown}{text}</details>\n"
+    text = _render_card(card.read_text(encoding="utf-8", errors="replace")) if card.is_file() else ""
+    filtered = f'data-policy="{escape(policy)}" data-protocol="{escape(protocol)}"'
+    return f"<details {filtered}>\n{summary}\n{render_stages(result)}{shown}{text}</details>\n"
+
+
+def _render_card(text: str) -> str:
+    """Return a model card as HTML; HTML in the card is shown as text."""
+    return f'<div class="card">\n{MarkdownIt("js-default").render(text)}</div>\n'
 
 
 def _format_published(row: LeaderboardRow) -> str:

@@ -63,7 +63,7 @@ def _measure(result: Result, task: str, outcomes: Sequence[Outcome]) -> dict[str
         "interval": [round(success.low, _DIGITS), round(success.high, _DIGITS)],
         "rate_v0": compute_rate("success_v0") if "success_v0" in flags else None,
         "stages": {stage: compute_rate(stage) for stage in get_stage_names(task) if stage in flags - {"success"}},
-        "trained_here": not any(lacking[name] for name in configs) if configs <= lacking.keys() else None,
+        "training_matches": not any(lacking[name] for name in configs) if configs <= lacking.keys() else None,
     }
 
 

@@ -60,7 +60,7 @@ class LeaderboardRow(StrictModel):
         rate_v0: success rate by RoboCAS-v0's rule after the last step; None: the task has no basket.
         stages: by stage of the task, the fraction of the episodes that reached it.
         training: training data and training cost; None: not trained, or unknown.
-        trained_here: whether the training data has the task, scenes, objects and cameras of these episodes; None:
+        training_matches: whether the training data has the task, scenes, objects and cameras of these episodes; None:
             unknown, or not trained.
         parameters: number of parameters of the network.
         calibration: camera calibration that the policy observes; None: no cameras, or unknown.
@@ -94,7 +94,7 @@ class LeaderboardRow(StrictModel):
     rate_v0: Rate | None = None
     stages: dict[str, Rate] = {}
     training: Training | None = None
-    trained_here: bool | None = None
+    training_matches: bool | None = None
     parameters: Count | None = None
     calibration: Calibration | None = None
     differences: list[str] = []

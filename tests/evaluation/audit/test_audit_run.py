@@ -1,5 +1,6 @@
 """`robocas eval audit` replays the stored actions of a result, and finds forged outcomes."""
 
+import dataclasses
 import json
 import shutil
 from dataclasses import asdict, replace
@@ -267,6 +268,9 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
     printed = capsys.readouterr().out
     assert "episode 1, recorded -> replayed: measures.path_length" in printed and "nothing was written" in printed
     assert (out / "results.json").read_bytes() == before
+    assert leaderboard.build(dataclasses.replace(build, skip_failed=True)) == 0
+    assert all(row.published for row in read_leaderboard(out / "results.json").rows)
+    assert "mine/smoke" in (out / "index.html").read_text() and "mine/smoke" in (out / "results.md").read_text()
 
 
 def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from robocas_ms3.evaluation.results.result_files import read_result
 pytestmark = pytest.mark.slow
 ENTRIES = Path(__file__).resolve().parents[3] / "leaderboard"
 SHOWN = """column => [...document.querySelectorAll('table.filtered tbody tr')]
-    .filter(row => !row.hidden).map(row => row.cells[column].textContent)"""
+    .filter(row => !row.hidden).map(row => row.cells[column].firstChild?.textContent ?? '')"""
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +35,10 @@ def test_page_has_no_errors_and_no_overflow(page, url, width, dark):
     check_layout(page, url, width, dark)
 
 
-@pytest.mark.parametrize("name", ["protocol", "track", "training data"])
+@pytest.mark.parametrize("name", ["protocol", "track", "policy", "training data"])
 def test_each_choice_of_a_filter_shows_its_rows(page, url, name):
     page.goto(url)
-    selection = f"label:has-text('{name}') select"
+    selection = f"select[data-name='{name}']"
     column = page.get_attribute(selection, "data-column")
     choices = page.eval_on_selector_all(f"{selection} option", "found => found.map(option => option.value)")
     assert choices[0] == "" and len(choices) > 3
@@ -47,3 +47,13 @@ def test_each_choice_of_a_filter_shows_its_rows(page, url, name):
     for value in choices[1:]:
         page.select_option(selection, value)
         assert page.evaluate(SHOWN, column) == [value] * everything.count(value) != []
+    assert page.locator("#empty").is_hidden()
+
+
+def test_filters_apply_to_the_entries_too(page, url):
+    page.goto(url)
+    page.select_option("select[data-name=policy]", "keyframe")
+    page.select_option("select[data-name=protocol]", "paper-v1")
+    assert page.locator("summary:visible").all_inner_texts() == ["keyframe, paper-v1"]
+    page.select_option("select[data-name=policy]", "scripted")
+    assert page.locator("#empty").is_visible() and page.locator("summary:visible").count() == 0

@@ -12,7 +12,14 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.leaderboard.entries import find_card
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
-from robocas_ms3.evaluation.leaderboard.output import PAGE, ROWS, AuditedResult, rank_rows, write_leaderboard_page
+from robocas_ms3.evaluation.leaderboard.output import (
+    MARKDOWN,
+    PAGE,
+    ROWS,
+    AuditedResult,
+    rank_rows,
+    write_leaderboard_page,
+)
 from robocas_ms3.evaluation.leaderboard.page import video_folder
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
 from robocas_ms3.evaluation.protocols.protocol import load_protocol
@@ -48,16 +55,25 @@ def test_page_has_a_row_per_task_and_the_published_results(tmp_path):
     audited = {(row.task, row.audited, row.audited_with_tolerances) for row in rows}
     assert audited == {("pick", 2, 0), ("select", 0, 1), ("search", 0, 0), ("open_pick", 0, 0)}
     page = (out / PAGE).read_text()
-    assert page.count("<td>first (mine)</td>") == page.count("<td>second (mine)</td>") == len(tasks)
+    assert page.count("<td>first (mine)<small>") == page.count("<td>second (mine)<small>") == len(tasks)
     assert len(re.findall("<summary>(?:first|second), smoke</summary>", page)) == 2
     assert "RT-1" in page and "<option>first (mine)</option>" in page
 
 
 def test_page_has_the_model_card_of_each_entry(tmp_path):
     results, out = make_results(tmp_path, "first"), tmp_path / "out"
-    find_card(results[0].result.folder).write_text("# Model card: <first>\n")
+    text = "# Model card: <first>\n\n| a | b |\n|---|---|\n| 1 | [x](javascript:alert) |\n\n<script>alert(1)</script>\n"
+    find_card(results[0].result.folder).write_text(text)
     write_leaderboard_page(results, out)
-    assert "<pre># Model card: &lt;first&gt;" in (out / PAGE).read_text()
+    page = (out / PAGE).read_text()
+    assert "<h1>Model card: &lt;first&gt;</h1>" in page and "<td>1</td>" in page
+    assert 'href="javascript' not in page and "<script>alert" not in page
+
+
+def test_results_with_problems_are_named(tmp_path):
+    results, out = make_results(tmp_path, "first"), tmp_path / "out"
+    write_leaderboard_page(results, out, ["second/paper-v1"])
+    assert "second/paper-v1" in (out / PAGE).read_text() and "second/paper-v1" in (out / MARKDOWN).read_text()
 
 
 def test_videos_in_the_folder_of_a_result_are_linked(tmp_path):

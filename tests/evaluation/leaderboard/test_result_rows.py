@@ -50,7 +50,7 @@ def test_row_of_a_trained_policy(tmp_path):
         seconds=3360,
         hardware="1 x x86_64 CPU, 2 threads",
     )
-    assert (row.trained_here, row.parameters, row.calibration) == (True, 1_857_000, "nominal")
+    assert (row.training_matches, row.parameters, row.calibration) == (True, 1_857_000, "nominal")
     assert (row.published, row.differences, row.weights) == (False, [], "ee" * 32)
     assert row.versions == {"robocas_ms3": "0.1.0", "torch": "2.4"}
 
@@ -59,7 +59,7 @@ def test_one_row_per_task_and_split_says_whether_the_policy_was_trained_in_its_s
     outcomes = [outcome(0), outcome(1, 0, split="new", config="other"), outcome(2, task="select", config="select")]
     lacking = {"table": [], "other": ["objects plum"], "unused": []}
     rows = make_rows(write(tmp_path / "a", outcomes, policy=TRAINED, training_differences=lacking))
-    found = {(row.task, row.split): (row.n, row.successes, row.trained_here) for row in rows}
+    found = {(row.task, row.split): (row.n, row.successes, row.training_matches) for row in rows}
     assert found == {("pick", "test"): (1, 1, True), ("pick", "new"): (1, 0, False), ("select", "test"): (1, 1, None)}
 
 
@@ -67,7 +67,9 @@ def test_row_of_an_untrained_policy_with_weld_and_noise(tmp_path):
     spec = {"state": True, "track": "end-to-end"}
     run = {"weld": True, "action_noise": [0.5, 0.2], "policy": {"name": "mine", "spec": spec}}
     (row,) = make_rows(write(tmp_path / "a", [outcome(0)], **run))
-    assert row.track == "privileged" and row.training is None and row.trained_here is None and row.calibration is None
+    assert (
+        row.track == "privileged" and row.training is None and row.training_matches is None and row.calibration is None
+    )
     assert row.differences == ["RoboCAS-v0's weld", "action noise of 0.5 mm and 0.2 degrees"]
 
 
@@ -104,7 +106,7 @@ def test_invalid_values_of_a_result_are_an_error(tmp_path, changed):
 def test_markdown_has_a_table_per_protocol_and_names_what_is_not_comparable(tmp_path):
     (row,) = make_rows(write(tmp_path / "a", [outcome(0)], policy=TRAINED, training_differences={"table": []}))
     short = row.model_copy(update={"n_protocol": 200, "errors": 1, "calibration": "true", "differences": ["weld"]})
-    other = row.model_copy(update={"protocol_hash": "ff" * 32, "trained_here": False})
+    other = row.model_copy(update={"protocol_hash": "ff" * 32, "training_matches": False})
     text = render_leaderboard([short, other])
     first, second = (line for line in text.splitlines() if line.startswith("| runs/mine"))
     assert "| modular | pick | test | 1 | 100.0 (2.5 to 100.0) | 100.0 |" in first
