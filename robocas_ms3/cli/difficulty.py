@@ -87,6 +87,8 @@ def main(cfg: Difficulty) -> int:
         print_line(f"note: the search of {format_count(cut, 'scene')} is not complete (docs/difficulty.md)")
     print_line(f"{format_count(len(scenes), 'scene')} measured, {format_count(problems, 'seed')} without a result")
     print_line(f"results: {out}")
+    if cfg.protocol and not problems and Path(cfg.protocol).is_dir():
+        print_line(f"next: copy {out / 'difficulty.jsonl'} to {cfg.protocol}")
     if cfg.protocol and problems:
         print_line("difficulty.jsonl was not written: run the same command again, or leave out these seeds")
     return 1 if problems else 0

@@ -21,7 +21,8 @@ class PlacePolicies:
 
     Each task has its own scale, from 0 (easiest scene of the protocol) to 10 (hardest scene). clutter-scale-v1 has a
     fixed scale of pick. Without a fixed scale, or with --fit, it is fitted to the policies with 10 to 90 % success in
-    the task; at least two are necessary. Writes clutter_scale.json, curves.json and clutter_scale.png.
+    the task; at least two are necessary. Writes clutter_scale.json, curves.json and clutter_scale.png, and replaces
+    existing ones.
 
     Example: robocas eval clutter-scale eval/mine --out eval/scale
     """
@@ -46,7 +47,7 @@ def clutter_scale(cfg: PlacePolicies) -> int:
     require_extra("plots", "the plot of the clutter scale", "matplotlib")
     from robocas_ms3.evaluation.clutter_scale.figure import write_curves
     from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
-    from robocas_ms3.evaluation.clutter_scale.study import describe_rates, make_study
+    from robocas_ms3.evaluation.clutter_scale.study import describe_counts, make_study
     from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     results = read_evaluations(cfg.folders)
@@ -71,9 +72,13 @@ def clutter_scale(cfg: PlacePolicies) -> int:
         print_table((f"feature in {name}", "difficulty per standard deviation"), rows)
         if task.mean_auc is not None and not study.is_fixed:
             print_line(f"{name}: mean AUC in scenes that were not used for the fit: {task.mean_auc:.2f}")
-    for name, rates in study.left_out.items():
+    for name, counts in study.left_out.items():
         reason = "the protocol has none" if study.is_fixed else "too few policies have 10 to 90 % success"
-        print_line(f"{name}: no scale, because {reason}: {describe_rates(rates)}")
+        print_line(f"{name}: no scale, because {reason}: {describe_counts(counts)}")
+    print_line(
+        "difficulty: 0 is the easiest scene of the protocol, 10 the hardest; none: success does not fall with the "
+        "difficulty. AUC: probability that a failed scene is more difficult than a solved one; 0.5: no relation"
+    )
     if study.is_fixed:
         print_line("The scale is the fixed one of the protocol; to fit it to these results, pass --fit.")
     print_line(f"wrote {SCALE_FILE}, curves.json and clutter_scale.png to {cfg.out}")

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.cli.eval_audit import ReplayOptions, replay_result
-from robocas_ms3.cli.eval_results import Results
 from robocas_ms3.cli.options import Folders, Maybe, resumable
 from robocas_ms3.core.text import format_count
 
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
 
 
-@dataclass(kw_only=True)
-class Add(Results):
+@dataclass
+class Add:
     """Add a result to an entry, a folder with the results and the model card of a policy.
 
     The copy has all outcomes, and the stored actions of 50 episodes that the protocol fixes. The result is first
@@ -29,6 +28,8 @@ class Add(Results):
     Example: robocas leaderboard add eval/pick --out leaderboard/mine/paper-v1 --card card.md
     """
 
+    folders: Folders
+    """Folder of a result on a bundled protocol, or folders of partial results of one evaluation, such as shards."""
     out: Annotated[Path, tyro.conf.arg(metavar="ENTRY/PROTOCOL")]
     """Folder of the result in the entry."""
     card: Annotated[Maybe[Path], tyro.conf.arg(metavar="FILE")] = None
@@ -71,11 +72,16 @@ class Build(ReplayOptions):
 def add(cfg: Add) -> int:
     from robocas_ms3.cli.eval_results import read
     from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.leaderboard.entries import find_card, write_result
+    from robocas_ms3.evaluation.protocols.bundled_protocols import bundled_protocols
     from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     result = read(cfg.folders)
-    protocol = load_protocol_of(result, cfg.protocol)
+    if (name := result.run.protocol) not in (bundled := bundled_protocols()):
+        what, fix = "the leaderboard has only results on bundled protocols", f"Evaluate on {', '.join(bundled)}."
+        raise EvaluationError(what, where=cfg.folders[0], found=name, fix=fix)
+    protocol = load_protocol_of(result)
     sample = write_result(result, protocol, cfg.out, card=cfg.card, overwrite=cfg.overwrite)
     print_line(f"wrote {cfg.out}: {format_count(len(result.outcomes), 'episode')}, actions of {len(sample)}")
     if not find_card(cfg.out).exists():
@@ -167,10 +173,10 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
     summary = replay_result(result, protocol, cache / hash_audit(result), cfg, stored=stored)
     if summary.differences:
         return None
-    count = summary.with_tolerances
-    mode = f", {count} of them within tolerances from checkpoint to checkpoint" if count else ""
-    sample = "" if cfg.sample is None else f", sample with seed {summary.plan.seed}"
-    print_line(f"{folder}: no differences in {format_count(len(summary.episodes), 'episode')}{mode}{sample}")
+    count, diverged = len(summary.episodes), summary.with_tolerances
+    mode = f", {diverged} within the tolerances from checkpoint to checkpoint" if diverged else ""
+    sample = "" if cfg.sample is None else f" (sample with seed {summary.plan.seed})"
+    print_line(f"{folder}: {format_count(count, 'episode')} replayed{sample}: {count - diverged} equal{mode}")
     return AuditedResult(result, protocol, summary.modes)
 
 

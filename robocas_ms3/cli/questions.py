@@ -147,21 +147,25 @@ def score(cfg: Score) -> int:
     )
 
     questions = read_questions(cfg.questions)
-    scores = [score_answers(str(path), questions, read_answers(path)) for path in cfg.answers]
+    stems = [path.stem for path in cfg.answers]
+    names = stems if len(set(stems)) == len(stems) else [str(path) for path in cfg.answers]
+    scores = [score_answers(name, questions, read_answers(path)) for name, path in zip(names, cfg.answers, strict=True)]
     scores += score_rules(questions)
     groups = {
         removals: [question for question in questions if question.removals == removals]
         for removals in sorted({question.removals for question in questions})
     }
-    headers = [f"{format_count(removals, 'removal')}, n = {len(group)}" for removals, group in groups.items()]
-    rows = []
+    rows, rows_by_removals = [], []
     for entry in scores:
         answered = "" if entry.answered is None else f"{_describe_rate(entry.answered)}, n = {entry.answered.n}"
-        by_removals = [_describe_rate(entry.by_removals[removals]) for removals in groups]
-        rows.append((entry.name, _describe_rate(entry.accuracy), *by_removals, answered))
-    chances = [compute_chance(group) for group in (questions, *groups.values())]
-    rows.append(("random object (expected)", *(f"{100 * chance:.1f}" for chance in chances), ""))
-    print_table(("answers", f"all, n = {len(questions)}", *headers, "questions with an answer"), rows)
+        rows.append((entry.name, _describe_rate(entry.accuracy), answered))
+        rows_by_removals.append((entry.name, *(_describe_rate(entry.by_removals[removals]) for removals in groups)))
+    rows.append(("random object (expected)", f"{100 * compute_chance(questions):.1f}", ""))
+    chances = [f"{100 * compute_chance(group):.1f}" for group in groups.values()]
+    rows_by_removals.append(("random object (expected)", *chances))
+    print_table(("answers", f"all, n = {len(questions)}", "with an answer"), rows)
+    heads = [f"{format_count(removals, 'removal')}, n = {len(group)}" for removals, group in groups.items()]
+    print_table(("answers", *heads), rows_by_removals)
     print_line("correct answers in %, with exact 95 % intervals; a question without an answer counts as wrong")
     return 0
 

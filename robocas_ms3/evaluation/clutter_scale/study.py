@@ -81,12 +81,12 @@ class ClutterStudy:
     Attributes:
         is_fixed: whether the scales are those of the protocol; otherwise they were fitted to the results.
         tasks: scale and policies by task.
-        left_out: by task without a scale, the success rate of each policy.
+        left_out: by task without a scale, the numbers of successes and episodes of each policy.
     """
 
     is_fixed: bool
     tasks: dict[str, TaskStudy]
-    left_out: dict[str, dict[str, float]]
+    left_out: dict[str, dict[str, tuple[int, int]]]
 
     def write(self, folder: Path) -> None:
         """Write the scales as `SCALE_FILE`, and the policies as ``curves.json``; infinite limits are null."""
@@ -106,24 +106,25 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
     are left out.
 
     Raises:
-        EvaluationError: a result has another protocol, two results have the same policy and noise, the fixed scale is
-            damaged or lacks the tasks of the results, or no task has two policies between 10 and 90 %.
+        EvaluationError: a result has another protocol, two results have the same policy, noise and task, the fixed
+            scale is damaged or lacks the tasks of the results, or no task has two policies between 10 and 90 %.
     """
     for result in results:
         if result.run.protocol_hash != protocol.hash:
             found = f"{result.run.protocol}, hash {result.run.protocol_hash[:16]}"
             expected = f"{protocol.rules.name}, hash {protocol.hash[:16]}"
             raise EvaluationError("result of another protocol", where=result.folder, expected=expected, found=found)
-    folders: dict[str, Path] = {}
+    folders: dict[tuple[str, str], Path] = {}
     for result in results:
-        if (first := folders.setdefault(describe_policy(result), result.folder)) != result.folder:
-            what, fix = "two results of the same policy", "Pass one of them."
-            raise EvaluationError(
-                what, where=result.folder, expected=f"only {first}", found=describe_policy(result), fix=fix
-            )
+        for task in sorted({outcome.task for outcome in result.outcomes.values()}):
+            if (first := folders.setdefault((describe_policy(result), task), result.folder)) != result.folder:
+                what, fix = f"two results of the same policy in {task}", "Pass one of them."
+                raise EvaluationError(
+                    what, where=result.folder, expected=f"only {first}", found=describe_policy(result), fix=fix
+                )
     fixed = None if fit else read_scales(protocol.folder / SCALE_FILE)
     tasks: dict[str, TaskStudy] = {}
-    left_out: dict[str, dict[str, float]] = {}
+    left_out: dict[str, dict[str, tuple[int, int]]] = {}
     for task, evaluated in split_by_task(results, protocol).items():
         fitted = evaluated.find_fitted()
         if fixed is not None and task in fixed:
@@ -131,7 +132,7 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
         elif fixed is None and fitted.sum() >= MIN_POLICIES:
             tasks[task] = _fit_task(evaluated, fitted)
         else:
-            left_out[task] = evaluated.list_rates()
+            left_out[task] = evaluated.count_successes()
     if not tasks and fixed is not None:
         what, fix = "no fixed scale of the tasks of these results", "Pass --fit and the results of several policies."
         where, expected = protocol.folder / SCALE_FILE, ", ".join(fixed)
@@ -139,14 +140,14 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
     if not tasks:
         what = "too few policies to fit a scale"
         wanted = f"{MIN_POLICIES} policies with 10 to 90 % success in at least {MIN_EPISODES} episodes of a task"
-        found = "; ".join(f"{task}: {describe_rates(rates)}" for task, rates in left_out.items())
+        found = "; ".join(f"{task}: {describe_counts(counts)}" for task, counts in left_out.items())
         raise EvaluationError(what, expected=wanted, found=found, fix="Add results of other policies.")
     return ClutterStudy(fixed is not None, tasks, left_out)
 
 
-def describe_rates(rates: Mapping[str, float]) -> str:
-    """Return success rates by name as a text."""
-    return ", ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
+def describe_counts(counts: Mapping[str, tuple[int, int]]) -> str:
+    """Return numbers of successes and episodes by name as a text."""
+    return ", ".join(f"{name} {successes}/{episodes}" for name, (successes, episodes) in counts.items())
 
 
 def _fit_task(task: TaskResults, fitted: NDArray[np.bool_]) -> TaskStudy:

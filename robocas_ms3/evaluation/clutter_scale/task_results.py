@@ -40,10 +40,10 @@ class TaskResults:
         counts, rates = (~np.isnan(self.successes)).sum(axis=1), np.nanmean(self.successes, axis=1)
         return (counts >= MIN_EPISODES) & (rates >= FITTED_RATES[0]) & (rates <= FITTED_RATES[1])
 
-    def list_rates(self) -> dict[str, float]:
-        """Return the success rate of each policy by its name."""
-        rates = np.nanmean(self.successes, axis=1).tolist()
-        return {describe_policy(result): rate for result, rate in zip(self.results, rates, strict=True)}
+    def count_successes(self) -> dict[str, tuple[int, int]]:
+        """Return the numbers of successes and episodes of each policy by its name."""
+        counts = [(int(np.nansum(row)), int((~np.isnan(row)).sum())) for row in self.successes]
+        return {describe_policy(result): count for result, count in zip(self.results, counts, strict=True)}
 
 
 def split_by_task(results: Sequence[Result], protocol: LoadedProtocol) -> dict[str, TaskResults]:

@@ -29,7 +29,10 @@ _FILE_NAME = re.compile(r"(\d{6,})\.npz")
 _LARGEST_STEPS = 10**7  # as the rules of a protocol allow
 _OTHER_BYTES = 4096  # of an archive, in addition to the values
 _LARGEST_STATE = 2**14  # numbers per state
-_FIX = "Restore the file, or evaluate again with --overwrite."
+_FIX = (
+    "Restore the file, or evaluate again with --overwrite. Entries of the leaderboard have the actions of some "
+    "episodes only: check them with robocas leaderboard audit."
+)
 
 
 def find_actions_file(folder: Path, episode: int) -> Path:

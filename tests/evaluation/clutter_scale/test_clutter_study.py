@@ -229,6 +229,19 @@ def test_two_results_of_the_same_policy_are_refused(study):
         make_study([*results.values(), read_result(folder / "again")], protocol)
 
 
+def test_results_of_the_same_policy_may_have_different_tasks(study):
+    _, protocol, results = study
+    parts = []
+    for result in results.values():
+        for task in ("pick", "search"):
+            outcomes = {number: one for number, one in result.outcomes.items() if one.task == task}
+            parts.append(replace(result, folder=result.folder / task, outcomes=outcomes))
+    whole, joined = (make_study(list(found), protocol, fit=True) for found in (results.values(), parts))
+    assert {name: task.policies for name, task in whole.tasks.items()} == {
+        name: task.policies for name, task in joined.tasks.items()
+    }
+
+
 def test_episodes_that_are_not_in_the_protocol_are_refused(study):
     folder, protocol, results = study
     copy = shutil.copytree(results["weak"].folder, folder / "longer")

@@ -57,6 +57,14 @@ def test_an_entry_needs_a_model_card(result, tmp_path, capsys):
     assert "model card" not in capsys.readouterr().out
 
 
+def test_a_result_on_a_protocol_that_is_not_bundled_is_refused(result, tmp_path):
+    record = json.loads((result.folder / RUN).read_text())
+    (result.folder / RUN).write_text(json.dumps(record | {"protocol": "mine"}))
+    with pytest.raises(EvaluationError):
+        add(Add((result.folder,), out=tmp_path / "entry" / "mine"))
+    assert not (tmp_path / "entry").exists()
+
+
 def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     protocol = load_protocol("smoke")
