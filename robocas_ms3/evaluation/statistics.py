@@ -225,8 +225,8 @@ def make_power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | 
     if c.p_value <= alpha:
         return None
     shown = find_smallest_difference(c.n, (c.only_a + c.only_b) / c.n, alpha=alpha)
-    difference = (
-        "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points or more"
-    )
-    count = "1 episode shows" if c.n == 1 else f"{c.n} episodes show"
-    return f"no significant difference: {count} {difference} ({100 * _POWER:g} % power)"
+    count = "1 episode is" if c.n == 1 else f"{c.n} episodes are"
+    if shown is None:
+        return f"no significant difference: {count} too few to detect any difference with {100 * _POWER:g} % power"
+    least = f"{np.ceil(100 * shown):.0f} percentage points"
+    return f"no significant difference: {count} enough to detect {least} or more with {100 * _POWER:g} % power"

@@ -181,11 +181,9 @@ def test_smallest_difference_has_80_percent_power(n, discordant):
 
 def test_warning_names_the_detectable_difference():
     assert make_power_warning(Comparison.from_counts(20, 8, 5, 7)) == (
-        "no significant difference: 40 episodes show differences of 26 points or more (80 % power)"
+        "no significant difference: 40 episodes are enough to detect 26 percentage points or more with 80 % power"
     )
-    assert "5 episodes show no difference, however large" in (
-        make_power_warning(Comparison.from_counts(0, 5, 0, 0)) or ""
-    )
+    assert "5 episodes are too few" in (make_power_warning(Comparison.from_counts(0, 5, 0, 0)) or "")
     assert make_power_warning(Comparison.from_counts(0, 6, 0, 0)) is None  # p = 1/32
     assert make_power_warning(Comparison.from_counts(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
 

@@ -75,6 +75,8 @@ def compare_results(results: Sequence[Result]) -> str:
     differing += ["versions"] if any(run.versions != first.run.versions for run in others) else []
     if differing:
         head += f" **Measured with different {' and '.join(differing)}.**"
+    if any(run.policy.track != first.run.policy.track for run in others):
+        head += " **The policies have different tracks: they do not observe the same.**"
     configs = sorted({first.outcomes[number].config for number in shared})
     rows = []
     pooled = len({(first.outcomes[number].task, first.outcomes[number].seed) for number in shared}) == len(shared)
@@ -146,8 +148,8 @@ def _render_table(head: str, where: str, rows: list[ComparisonRow]) -> str:
         for number, p in zip(family, adjust_p_values([rows[number].found.p_value for number in family]), strict=True):
             adjusted[number] = p, len(family)
     lines = [
-        f"{head} McNemar's exact test, Tango's 95 % interval. Decide by Holm's p, adjusted for all rows except "
-        f"`{ALL}`, and separately for the rows `{ALL}`.",
+        f"{head} Second - first: percentage points. McNemar's exact test, Tango's 95 % interval. Decide by Holm's p, "
+        f"adjusted for all rows except `{ALL}`, and separately for the rows `{ALL}`.",
         "",
         f"| {where} | first, second | tracks | n | first | second | only first | only second | second - first | p "
         "| Holm's p |",
