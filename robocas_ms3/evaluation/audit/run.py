@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import secrets
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -25,7 +25,7 @@ from robocas_ms3.evaluation.audit.differences import (
 )
 from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT, CheckpointEnv, StoredActionsPolicy
 from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol, ProtocolEpisode
-from robocas_ms3.evaluation.results.outcomes import Count, EvaluatedEpisode
+from robocas_ms3.evaluation.results.outcomes import Count, EvaluatedEpisode, Outcome, find_failure_stage
 from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.results.run_record import (
     describe_machine,
@@ -36,6 +36,7 @@ from robocas_ms3.evaluation.results.run_record import (
 from robocas_ms3.evaluation.rollouts.rollout import count_checkpoint_steps
 from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
+from robocas_ms3.scenes.task_specs import TASKS
 
 OUTPUT = FolderKind("robocas eval audit", ("audit.json",), "result_hash")
 _EPISODES = "episodes.jsonl"
@@ -225,9 +226,18 @@ def _replay_checkpoints(
         for replayed in _run_episodes(session, episodes):
             number = replayed.outcome.episode
             deviations = opened[-1].deviations.get(number, [])
-            differences = list_large_differences(result.outcomes[number], replayed.outcome, period)
+            outcome = _replace_stages(replayed.outcome, opened[-1].lost_stages.get(number, {}), 1 / session.rate)
+            differences = list_large_differences(result.outcomes[number], outcome, period)
             differences += list_deviations(result.read_checkpoints(number), deviations, period)
             yield AuditedEpisode(number, differences, "checkpoints")
+
+
+def _replace_stages(outcome: Outcome, stages: Mapping[str, tuple[int, int] | None], control_dt: float) -> Outcome:
+    """Return an outcome with other times of some stages, given as policy step and control step (`CheckpointEnv`)."""
+    flags = {**outcome.flags, **{name: again and again[0] for name, again in stages.items()}}
+    seconds = {name: again and round(again[1] * control_dt, 4) for name, again in stages.items()}
+    failure_stage = find_failure_stage(flags, outcome.error, TASKS[outcome.task].stages)
+    return replace(outcome, flags=flags, flag_seconds={**outcome.flag_seconds, **seconds}, failure_stage=failure_stage)
 
 
 def _open_session(

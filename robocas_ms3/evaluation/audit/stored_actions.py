@@ -76,11 +76,15 @@ class CheckpointEnv:
 
     Attributes:
         deviations: by number of the episode, how far the state was from each checkpoint.
+        lost_stages: by number of the episode, the stages that the replay had reached, but not the checkpoint to which
+            it returned, each with the policy step and the control step at which it was reached again; None: it was
+            not.
     """
 
     def __init__(self, env: Any, policy: StoredActionsPolicy, result: Result) -> None:
         self._env, self._policy, self._result, self.num_envs = env, policy, result, env.num_envs
         self.deviations: dict[int, list[StateDeviation]] = {}
+        self.lost_stages: dict[int, dict[str, tuple[int, int] | None]] = {}
         self._checkpoints: dict[int, Checkpoints] = {}  # by episode
 
     def reset(self, **kwargs: Any) -> Any:
@@ -89,6 +93,9 @@ class CheckpointEnv:
     def step(self, actions: Any) -> Any:
         results, calls = self._env.step(actions), {}
         for env, (episode, step) in self._policy.progress.items():
+            for stage, again in (lost := self.lost_stages.setdefault(episode, {})).items():
+                if again is None and results[-1][stage][env]:
+                    lost[stage] = step, int(results[-1]["elapsed_steps"][env])
             if episode not in self._checkpoints:
                 self._checkpoints[episode] = self._result.read_checkpoints(episode)
             steps, states = self._checkpoints[episode]
@@ -96,8 +103,10 @@ class CheckpointEnv:
                 # the last state is only compared, so that a success after it comes from the simulation
                 calls[env] = states[row], math.inf if step == steps[-1] else RESTORE_TOLERANCE
         if calls:
-            for env, deviation in self._env.call_each("restore_checkpoint", calls).items():
-                self.deviations.setdefault(self._policy.progress[env][0], []).append(deviation)
+            for env, (deviation, stages) in self._env.call_each("restore_checkpoint", calls).items():
+                episode = self._policy.progress[env][0]
+                self.deviations.setdefault(episode, []).append(deviation)
+                self.lost_stages[episode].update(dict.fromkeys(stages))
         return results
 
     def close(self) -> None:

@@ -32,7 +32,20 @@ def flatten_state(state: Mapping[str, Any]) -> torch.Tensor:
     return torch.cat([value.reshape(len(value), -1).float() for value in _list_values(state)], dim=1)
 
 
-def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> StateDeviation:
+def unflatten_state(like: Mapping[str, Any], row: np.ndarray) -> dict[str, Any]:
+    """Return the state of one env from a row of `flatten_state`, which may be longer, with the shapes of ``like``."""
+    values, start = {}, 0
+    for name, value in like.items():
+        if isinstance(value, Mapping):
+            values[name], size = unflatten_state(value, row[start:]), len(flatten_state(value)[0])
+        else:
+            size = value.numel()
+            values[name] = torch.from_numpy(row[start : start + size]).reshape(value.shape)
+        start += size
+    return values
+
+
+def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> tuple[StateDeviation, list[str]]:
     """Set poses and joint positions of a single env to those of a checkpoint if they are far from it.
 
     Then stages that were reached, but not in the checkpoint, are not reached any more. Velocities, controllers, other
@@ -45,7 +58,7 @@ def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> S
             weak grasp can slip. Infinite: only measure.
 
     Returns:
-        How far the state was from the checkpoint.
+        How far the state was from the checkpoint, and the stages that are not reached any more.
     """
     bodies = base.bodies
     present = bodies.read()
@@ -60,27 +73,19 @@ def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> S
         joint=float(joints.abs().max()),
     )
     if all(value <= tolerance for value in deviation):
-        return deviation
+        return deviation, []
     state, target = base.get_state_dict(), bodies.to_state_dict(recorded)
     for name, body in target["actors"].items():
         state["actors"][name] = torch.cat([body[:, :_POSE], state["actors"][name][:, _POSE:]], dim=1)
     for name, jointed in target["articulations"].items():
         state["articulations"][name] = state["articulations"][name].clone()
         state["articulations"][name][:, _joint_positions(jointed)] = jointed[:, _joint_positions(jointed)]
-    stages = state["task"]["stages"]
-    state["task"]["stages"] = stages & _read_stages(base, checkpoint[present.shape[1] :])
+    recorded_extra = unflatten_state(base.extra_state(), checkpoint[present.shape[1] :])
+    reached = state["task"]["stages"]
+    lost = reached & (recorded_extra["task"]["stages"] == 0)
+    state["task"]["stages"] = reached & ~lost
     base.set_state_dict(state)
-    return deviation
-
-
-def _read_stages(base: Any, extra: np.ndarray) -> torch.Tensor:
-    """Return the reached stages (1, stages) bool in the part of a checkpoint that is `RoboCASEnv.extra_state`."""
-    state, start = base.extra_state(), 0
-    for value in _list_values(state):
-        if value is state["task"]["stages"]:
-            return torch.from_numpy(extra[start : start + value.numel()])[None] > 0
-        start += value.numel()
-    raise AssertionError("unreachable")  # pragma: no cover
+    return deviation, [name for name, is_lost in zip(base.success_check.stages, lost[0], strict=True) if is_lost]
 
 
 def _list_values(state: Mapping[str, Any]) -> Iterator[torch.Tensor]:

@@ -53,6 +53,11 @@ class EpisodeMetrics:
         if self._retrieval is not None:
             self._retrieval.reset(envs)
 
+    def forget_grasp(self) -> None:
+        """Record moved objects again although the target was held, because an audit returned to an earlier state."""
+        if self._retrieval is not None:
+            self._retrieval.forget_grasp()
+
     def update(self, open_commands: np.ndarray) -> None:
         """Add a control step to the metrics.
 
@@ -156,6 +161,10 @@ class RetrievalTracker:
         time = to_native(self._env.elapsed_steps.to(torch.int32))[:, None]
         self._moved_at = where(now, self._steps[:, None] + 1, self._moved_at)
         self._moved_time = where(now, time, self._moved_time)
+
+    def forget_grasp(self) -> None:
+        """Continue as if the target had not been held in any env."""
+        self._held[:] = False
 
     def end_step(self) -> None:
         """Count a policy step."""

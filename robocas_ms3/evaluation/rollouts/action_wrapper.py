@@ -145,9 +145,12 @@ class PolicyActionWrapper(gym.Wrapper):
         own = torch.from_numpy(np.stack([self._open, self._width_change], axis=1).astype(np.float32))
         return torch.cat([self._base.bodies.read(), flatten_state(self._base.extra_state()), own], dim=1)
 
-    def restore_checkpoint(self, checkpoint: np.ndarray, tolerance: float) -> StateDeviation:
+    def restore_checkpoint(self, checkpoint: np.ndarray, tolerance: float) -> tuple[StateDeviation, list[str]]:
         """Set the state of a single env to that of a checkpoint (D,) if it is far from it (`restore_checkpoint`)."""
-        return restore_checkpoint(self._base, checkpoint, tolerance)
+        deviation, lost_stages = restore_checkpoint(self._base, checkpoint, tolerance)
+        if "target_grasped" in lost_stages:
+            self._metrics.forget_grasp()
+        return deviation, lost_stages
 
     def _timed_step(self, motion: TcpMotion) -> tuple:
         start = self._tcp_pose() if self._reference == "tcp" else self._commanded_pose()

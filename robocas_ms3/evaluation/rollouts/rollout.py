@@ -31,7 +31,6 @@ from robocas_ms3.evaluation.results.metrics import read_metric
 from robocas_ms3.evaluation.results.outcomes import (
     MEASURES,
     NO_CHECKPOINTS,
-    PAPER_STAGES,
     Checkpoints,
     Outcome,
     Retrieval,
@@ -165,7 +164,6 @@ class EpisodeBatch:
         self._info: dict[str, Any] = {}
         self._flags: list[str] = []  # names of the flags in ``info``
         self._held = np.zeros((0, self.num_envs), dtype=bool)  # (flags, N) whether a flag has held
-        self._are_stages = np.zeros(0, dtype=bool)  # whether a flag is a stage
         self._embed = TextEmbedder() if spec.language == "embedding" else None
         self._calibration: CameraCalibration | None = None  # None before the first reset, or without cameras
 
@@ -189,8 +187,6 @@ class EpisodeBatch:
         if not self._flags:
             self._flags = [name for name, value in info.items() if _is_flag(value)]
             self._held = np.zeros((len(self._flags), self.num_envs), dtype=bool)
-            stages = {*PAPER_STAGES.values(), *(stage for task in TASKS.values() for stage in task.stages)}
-            self._are_stages = np.array([name in stages for name in self._flags])
         self._held[:, envs] = False
         self._record_flags()
         return starts
@@ -287,19 +283,14 @@ class EpisodeBatch:
             episode.checkpoints.append((episode.steps, self._info[CHECKPOINT][episode.spec.env].copy()))
 
     def _record_flags(self) -> None:
-        present = np.array([self._info[name] for name in self._flags])
-        # a reached stage stays reached, unless an audit returns to a state in which it was not
-        taken_back = self._held & ~present & self._are_stages[:, None]
-        new = present & ~self._held
-        for flag, env in np.argwhere(new | taken_back) if (new | taken_back).any() else ():
-            self._held[flag, env] = present[flag, env]
-            if env not in self.running:
-                continue
-            episode, name = self.running[env], self._flags[flag]
-            if present[flag, env]:
+        new = np.array([self._info[name] for name in self._flags]) & ~self._held
+        if not new.any():
+            return
+        for flag, env in np.argwhere(new):
+            self._held[flag, env] = True
+            if env in self.running:
+                episode, name = self.running[env], self._flags[flag]
                 episode.flags[name], episode.flag_seconds[name] = episode.steps, round(self._elapsed_seconds(env), 4)
-            else:
-                del episode.flags[name], episode.flag_seconds[name]
 
     def _read_simulation_state(self, env: int) -> SimulationState:
         found, episode = self.obs["simulation"], self.running[env]

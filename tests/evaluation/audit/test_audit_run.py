@@ -1,9 +1,9 @@
 """`robocas eval audit` replays the stored actions of a result, and finds forged outcomes."""
 
-import dataclasses
 import json
 import shutil
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +31,8 @@ from robocas_ms3.evaluation.results.verify import find_violations
 from robocas_ms3.evaluation.rollouts import session
 from robocas_ms3.evaluation.rollouts.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
+
+ENTRIES = Path(__file__).resolve().parents[3] / "leaderboard"
 
 SMOKE = load_protocol("smoke")
 
@@ -268,7 +270,7 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
     printed = capsys.readouterr().out
     assert "episode 1, recorded -> replayed: measures.path_length" in printed and "nothing was written" in printed
     assert (out / "results.json").read_bytes() == before
-    assert leaderboard.build(dataclasses.replace(build, skip_failed=True)) == 0
+    assert leaderboard.build(replace(build, skip_failed=True)) == 0
     assert all(row.published for row in read_leaderboard(out / "results.json").rows)
     assert "mine/smoke" in (out / "index.html").read_text() and "mine/smoke" in (out / "results.md").read_text()
 
@@ -398,7 +400,6 @@ def test_episodes_of_another_processor_are_replayed_from_checkpoint_to_checkpoin
         write_checkpoints(out, number, checkpoints)
         mode, differences = audit_again(number)
         assert (mode, bool(differences)) == ("checkpoints", expected), differences
-    write_checkpoints(out, number, true.read_checkpoints(number))
     one = true.outcomes[number]
     for factor, expected in ((1.01, False), (1.2, True)):
         forge(out, number, measures=one.measures | {"path_length": one.measures["path_length"] * factor})
@@ -411,3 +412,24 @@ def test_episodes_of_another_processor_are_replayed_from_checkpoint_to_checkpoin
     shutil.rmtree(out / "checkpoints")
     mode, differences = audit_again(number)
     assert mode == "exact" and differences
+
+
+def test_a_stage_that_a_checkpoint_lacks_counts_from_when_it_is_reached_again(tmp_path):
+    true = read_result(ENTRIES / "keyframe" / "clutter-scale-v1")
+    protocol, out = load_protocol(true.run.protocol), tmp_path / "result"
+    shutil.copytree(true.folder, out)
+    (out / RUN).write_text(json.dumps(true.run.to_dict() | {"machine": {"model": "Other"}}))
+    for number in entries.list_stored_episodes(true, protocol):
+        steps, lifted = true.read_checkpoints(number).steps, true.outcomes[number].flags["target_lifted"]
+        if lifted is not None and len(steps) >= (first := int((steps < lifted).sum())) + 5:  # held for 3 s at least
+            break
+    for row, is_late in ((first, False), (first + 2, True)):  # the checkpoint after which the stage is reached
+        checkpoints = true.read_checkpoints(number)
+        stages = (checkpoints.states == (steps >= lifted)[:, None]).all(axis=0)
+        checkpoints.states[: row + 1, stages] = 0
+        checkpoints.states[row, 13] += 0.02  # x of the second body, m
+        write_checkpoints(out, number, checkpoints)
+        audit = tmp_path / f"audit_{row}"
+        (one,) = run_audit(read_result(out), protocol, audit, stored={number}, envs=1)
+        assert one.mode == "checkpoints"
+        assert any("flags.target_lifted" in text for text in one.differences) == is_late, one.differences

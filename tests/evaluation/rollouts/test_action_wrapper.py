@@ -78,7 +78,7 @@ def test_poses_and_joints_return_to_a_checkpoint_but_velocities_do_not():
     *_, info = env.step(along(0.02))
     checkpoint, base = info["checkpoint"][0].numpy(), env.unwrapped
     bodies = base.bodies.read().shape[1]
-    assert env.restore_checkpoint(checkpoint, 0.0) == (0, 0, 0)
+    assert env.restore_checkpoint(checkpoint, 0.0) == ((0, 0, 0), [])
     for _ in range(3):
         env.step(along(0.02))
     target = base.objects[int(base.target_slot[0])]
@@ -89,12 +89,12 @@ def test_poses_and_joints_return_to_a_checkpoint_but_velocities_do_not():
     forged = checkpoint.copy()
     first = base.bodies.actors.index(target.name) * 13
     forged[first + 7 : first + 13] = 9.0  # a velocity
-    deviation = env.restore_checkpoint(forged, np.inf)
+    deviation, _ = env.restore_checkpoint(forged, np.inf)
     assert deviation.target == deviation.body == pytest.approx(0.03, abs=1e-3)
     turned = np.abs(base.agent.robot.qpos[0].numpy() - qpos_in(base, checkpoint)).max()
     assert deviation.joint == pytest.approx(turned) and turned > 0.02
     assert (base.bodies.read()[0].numpy() == before).all()  # only measured
-    assert env.restore_checkpoint(forged, 0.05) == deviation  # a joint is farther away
+    assert env.restore_checkpoint(forged, 0.05) == (deviation, [])  # a joint is farther away
     after = base.bodies.read()[0].numpy()
     np.testing.assert_allclose(base.agent.robot.qpos[0], qpos_in(base, checkpoint), atol=1e-5)
     np.testing.assert_allclose(after[first : first + 7], checkpoint[first : first + 7], atol=1e-5)
@@ -113,7 +113,8 @@ def test_stages_that_a_checkpoint_lacks_are_taken_back():
     picked = info["checkpoint"][0].numpy()
     stages["target_lifted"][:] = True
     env.step(along(0.02))
-    env.restore_checkpoint(picked, 0.0)
+    stages["target_in_basket"][:] = True
+    assert env.restore_checkpoint(picked, 0.0)[1] == ["target_lifted", "target_in_basket"]
     assert stages["picked_any"].all() and not stages["target_lifted"].any()
     env.restore_checkpoint(checkpoint, np.inf)  # only measures
     assert stages["picked_any"].all()

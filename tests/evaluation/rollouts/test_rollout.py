@@ -55,22 +55,6 @@ def test_every_episode_runs_once_with_its_own_instruction(count, refill):
         assert policy.asked[3] == [1, 3]  # ended envs are not observed
 
 
-class ReturningEnv(CountingEnv):
-    """Env that returns to a state before the stages, after the third step."""
-
-    def step(self, actions: np.ndarray) -> tuple:
-        result = super().step(actions)
-        self.sums[self.elapsed == 3] = 0.0
-        return result
-
-
-def test_a_stage_that_is_taken_back_counts_from_when_it_is_reached_again():
-    (one,) = run_policy(ReturningEnv(1, 6.0), CountingPolicy(), starts(9), 12)
-    assert (one.steps, one.flags["target_lifted"], one.flag_seconds["target_lifted"]) == (9, 5, 0.25)
-    (one,) = run_policy(ReturningEnv(1, 6.0), CountingPolicy(), starts(4), 4)
-    assert (one.steps, one.flags["target_lifted"], one.flag_seconds["target_lifted"]) == (4, None, None)
-
-
 def test_all_actions_of_a_chunk_are_executed_before_the_next_call_of_the_policy():
     policy = CountingPolicy(chunk=3)
     ended = run_policy(CountingEnv(2, None), policy, starts(4, 7), 7)
