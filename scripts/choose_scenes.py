@@ -112,7 +112,7 @@ def main(options: Options) -> None:
     for (task, removals), found in sorted(groups.items()):
         name = f"{removals} or more removals, or none found" if removals == MOST_REMOVALS else f"removals: {removals}"
         print(f"{task}, {name}: {sum(scene.key in chosen for scene in found)} of {len(found)} scenes")
-    few = f"; there are no more than these of {options.scenes}" if len(chosen) < options.scenes else ""
+    few = f"; expected {options.scenes}, but the candidates have no more" if len(chosen) < options.scenes else ""
     print(f"wrote {len(chosen)} scenes to {options.out}{few}")
 
 

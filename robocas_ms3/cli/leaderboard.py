@@ -54,7 +54,7 @@ class Build(ReplayOptions):
     """Check and replay all entries, and write the leaderboard: index.html, results.md and results.json.
 
     The stored actions are replayed as in `robocas leaderboard audit`. The cache folder keeps the outcomes. If a result
-    has problems, nothing is written (exit status 1), unless --skip-failed leaves it out.
+    has problems, nothing is written (exit status 1), unless --skip-errors leaves it out.
 
     Example: robocas leaderboard build leaderboard --out leaderboard-page
     """
@@ -65,7 +65,7 @@ class Build(ReplayOptions):
     """Output folder."""
     videos: int = 0
     """Number of videos of failed episodes per result, made from the stored actions."""
-    skip_failed: bool = False
+    skip_errors: bool = False
     """Leave out results with problems. The page names them."""
 
 
@@ -79,7 +79,7 @@ def add(cfg: Add) -> int:
 
     result = read(cfg.folders)
     if (name := result.run.protocol) not in (bundled := bundled_protocols()):
-        what, fix = "the leaderboard has only results on bundled protocols", f"Evaluate on {', '.join(bundled)}."
+        what, fix = "the leaderboard has only results on bundled protocols", f"Evaluate on one of {', '.join(bundled)}."
         raise EvaluationError(what, where=cfg.folders[0], found=name, fix=fix)
     protocol = load_protocol_of(result)
     sample = write_result(result, protocol, cfg.out, card=cfg.card, overwrite=cfg.overwrite)
@@ -122,9 +122,9 @@ def build(cfg: Build) -> int:
         f"{get_entry_name(folder)}/{folder.name}" for folder, one in zip(folders, audited, strict=True) if one is None
     ]
     if bad:
-        what = "left out" if cfg.skip_failed else "nothing was written. --skip-failed leaves these results out"
-        print_line(f"{len(bad)} of {format_count(len(audited), 'result')} with problems; {what}: {', '.join(bad)}")
-        if not cfg.skip_failed:
+        print_line(f"{len(bad)} of {format_count(len(folders), 'result')} with problems: {', '.join(bad)}")
+        if not (cfg.skip_errors and results):
+            print_line("nothing was written" if cfg.skip_errors else "nothing was written; see --skip-errors")
             return 1
     if cfg.videos:
         for one in results:
@@ -159,18 +159,18 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
     try:
         result = read_result(folder)
         protocol = load_protocol_of(result)
+        stored = list_stored_episodes(result, protocol)
         problems = find_result_violations(result, protocol)
+        if not problems and (obstacle := find_audit_obstacle(result, stored)):
+            problems = [f"cannot be audited: {obstacle}"]
+        for problem in problems:
+            print_line(f"{folder}: {problem}")
+        if problems:
+            return None
+        summary = replay_result(result, protocol, cache / hash_audit(result), cfg, stored=stored)
     except RobocasError as error:  # the other results are checked all the same
         print_line(f"{folder}: {error}")
         return None
-    if not problems and (obstacle := find_audit_obstacle(result)):
-        problems = [f"cannot be audited: {obstacle}"]
-    if problems:
-        for problem in problems:
-            print_line(f"{folder}: {problem}")
-        return None
-    stored = list_stored_episodes(result, protocol)
-    summary = replay_result(result, protocol, cache / hash_audit(result), cfg, stored=stored)
     if summary.differences:
         return None
     count, diverged = len(summary.episodes), summary.with_tolerances

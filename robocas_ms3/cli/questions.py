@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -147,9 +147,9 @@ def score(cfg: Score) -> int:
     )
 
     questions = read_questions(cfg.questions)
-    stems = [path.stem for path in cfg.answers]
-    names = stems if len(set(stems)) == len(stems) else [str(path) for path in cfg.answers]
-    scores = [score_answers(name, questions, read_answers(path)) for name, path in zip(names, cfg.answers, strict=True)]
+    scores = [score_answers(str(path), questions, read_answers(path)) for path in cfg.answers]
+    if len({path.stem for path in cfg.answers}) == len(cfg.answers):  # paths would make the table wide
+        scores = [replace(entry, name=Path(entry.name).stem) for entry in scores]
     scores += score_rules(questions)
     groups = {
         removals: [question for question in questions if question.removals == removals]

@@ -31,8 +31,8 @@ class SceneDifficulty:
         removals: smallest number of removals (moves of an object) after which the target can be grasped; None: no
             sequence was found.
         first_removals: slots of the objects with which such a sequence can start.
-        scripted_removal: slot of the object that the scripted policy of search moves first (`choose_scripted_removal`);
-            None if no object has to be removed.
+        scripted_removal: slot of the object in the cheapest of the first feasible moves of the scripted policy of
+            search (`choose_scripted_removal`); None if no object has to be removed.
         simulated_removals: number of removals that the search has simulated.
         complete: whether the search has tried every sequence of its rules up to ``removals``, or up to
             ``max_removals`` if none was found.

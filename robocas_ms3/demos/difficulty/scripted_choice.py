@@ -13,11 +13,12 @@ from robocas_ms3.tasks.search import RoboCASSearchEnv
 
 
 def choose_scripted_removal(arm: Arm) -> int | None:
-    """Return the slot of the object that the scripted policy of search moves first, or None if no move is feasible.
+    """Return the slot of the object in the cheapest of the first feasible moves of the scripted policy of search.
 
-    Like the policy, the function simulates candidate moves in their order until three were feasible, and chooses the
-    move with the lowest cost. It simulates them from the present state of the arm, in forked processes. The result is
-    None for other tasks.
+    Like the policy, the function simulates candidate moves in their order until three were feasible. It simulates them
+    from the present state of the arm, in forked processes. The policy may compare fewer moves, and first moves the
+    gripper camera to the target, so its own choice may differ. The result is None if no move is feasible, and for other
+    tasks.
     """
     if not isinstance(arm.env, RoboCASSearchEnv):
         return None

@@ -112,14 +112,24 @@ def list_other_processors(result: Result) -> list[str]:
     return sorted({str((machine or {}).get("model")) for machine in machines if not is_same_processor(machine or {})})
 
 
-def find_audit_obstacle(result: Result) -> str:
-    """Return why the episodes of a result cannot be replayed; empty if they can."""
+def find_audit_obstacle(result: Result, stored: Collection[int] | None = None) -> str:
+    """Return why the episodes of a result cannot be replayed; empty if they can.
+
+    Versions of packages must be equal, without their local part, such as ``+cpu``. The version of robocas_ms3 may
+    differ: then the outcomes decide.
+
+    Args:
+        result: the result.
+        stored: numbers of the episodes whose actions are stored; None: all.
+    """
     if result.run.backend != "processes":
         return f"its backend is {result.run.backend}, whose physics is not repeatable; expected processes"
-    if not choose_episodes(result, None, 0):
+    if not choose_episodes(result, None, 0, stored):
         return "it has no episode that can be replayed"
-    installed, recorded = get_package_versions(), result.run.versions
-    if differing := [name for name in recorded if name in installed and installed[name] != recorded[name]]:
+    recorded = {name: version.partition("+")[0] for name, version in result.run.versions.items()}
+    installed = {name: version.partition("+")[0] for name, version in get_package_versions().items()}
+    del installed["robocas_ms3"]
+    if differing := [name for name in installed if recorded.get(name, installed[name]) != installed[name]]:
         names = ", ".join(f"{name} {recorded[name]}" for name in differing)
         return f"it was made with other versions: {names}. Install these versions"
     return ""

@@ -15,6 +15,7 @@ import hashlib
 from collections.abc import Collection
 from pathlib import Path
 
+from robocas_ms3.core.documents import read_text
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.files import atomic_file, atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
@@ -27,6 +28,7 @@ from robocas_ms3.evaluation.results.verify import check_consistency, find_violat
 
 CARD = "README.md"
 """Name of the model card in an entry."""
+_CARD_BYTES = 2**20
 SAMPLE_SIZE = 50
 """Number of episodes of a result whose actions are in an entry."""
 
@@ -92,8 +94,18 @@ def find_result_violations(result: Result, protocol: LoadedProtocol) -> list[str
         make_rows(result, protocol)
     except EvaluationError as error:
         found.append(str(error))
-    if not find_card(result.folder).is_file():
-        found.append(f"no model card {find_card(result.folder)}; write it, or pass --card to robocas leaderboard add")
+    if result.folder.name != protocol.rules.name:
+        found.append(f"the folder {result.folder.name} has another name than the protocol {protocol.rules.name}")
+    card = find_card(result.folder)
+    if not card.is_file():
+        found.append(f"no model card {card}; write it, or pass --card to robocas leaderboard add")
+    else:
+        try:
+            read_card(card)
+        except EvaluationError as error:
+            found.append(str(error))
+    if links := [path for path in (card, result.folder, *sorted(result.folder.rglob("*"))) if path.is_symlink()]:
+        found.append(f"{links[0]} is a symbolic link")
     return found
 
 
@@ -124,8 +136,8 @@ def write_result(
         what, fix = "the folder of the result has another name than its protocol", "See robocas leaderboard add --help."
         raise EvaluationError(what, where=out, expected=f"ENTRY/{protocol.rules.name}", fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
-    text = None if card is None else _read_card(card)
-    if text is not None and find_card(out).exists() and _read_card(find_card(out)) != text:
+    text = None if card is None else read_card(card)
+    if text is not None and find_card(out).exists() and read_card(find_card(out)) != text:
         if not any(find_card(out).parent.glob(f"*/{RUN}")):
             what, fix = "the README.md of a folder without results is not replaced", "Choose a new folder as ENTRY."
             raise OutputExistsError(what, where=find_card(out), fix=fix)
@@ -148,8 +160,9 @@ def write_result(
     return sample
 
 
-def _read_card(path: Path) -> str:
+def read_card(path: Path) -> str:
+    """Read a model card."""
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return read_text(path, _CARD_BYTES)
+    except (OSError, ValueError) as error:
         raise EvaluationError("cannot read the model card", where=path, found=error) from error

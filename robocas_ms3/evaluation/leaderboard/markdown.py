@@ -41,14 +41,14 @@ PUBLISHED_NOTE = (
 )
 
 
-def render_leaderboard(rows: Sequence[LeaderboardRow], left_out: Sequence[str] = ()) -> str:
+def render_leaderboard(rows: Sequence[LeaderboardRow], skipped: Sequence[str] = ()) -> str:
     """Return rows as Markdown: one table per protocol and its hash, and one table of published results.
 
-    ``left_out``: names of the results that are not in the rows because of a problem.
+    ``skipped``: names of the results that are not shown because of a problem.
     """
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
-    if left_out:
-        lines += ["", escape_markdown(describe_left_out(left_out))]
+    if skipped:
+        lines += ["", escape_markdown(describe_skipped(skipped))]
     if any(row.rank is not None for row in rows):
         lines += ["", RANK_NOTE]
     if any(not row.published and not row.entry for row in rows):
@@ -64,9 +64,9 @@ def render_leaderboard(rows: Sequence[LeaderboardRow], left_out: Sequence[str] =
     return "\n".join(lines) + "\n"
 
 
-def describe_left_out(names: Sequence[str]) -> str:
-    """Return a text that names results without an audit."""
-    return f"Left out, because the audit on this machine found a problem: {', '.join(names)}."
+def describe_skipped(names: Sequence[str]) -> str:
+    """Return a text that names the results that are not shown."""
+    return f"Not shown, because they have problems or their audit found differences: {', '.join(names)}."
 
 
 def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:

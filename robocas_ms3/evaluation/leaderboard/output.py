@@ -45,13 +45,13 @@ class AuditedResult(NamedTuple):
     modes: dict[int, Mode]
 
 
-def write_leaderboard_page(results: Sequence[AuditedResult], out: Path, left_out: Sequence[str] = ()) -> list[Path]:
+def write_leaderboard_page(results: Sequence[AuditedResult], out: Path, skipped: Sequence[str] = ()) -> list[Path]:
     """Write the leaderboard of audited results, and return the paths of its files.
 
     Args:
         results: the results.
         out: output folder; existing files of a leaderboard are replaced.
-        left_out: names of further results, which have a problem.
+        skipped: names of the results that are not shown because of a problem.
 
     Raises:
         EvaluationError: two results have the same policy, protocol, task and split.
@@ -60,8 +60,8 @@ def write_leaderboard_page(results: Sequence[AuditedResult], out: Path, left_out
     rows = sort_rows([*rank_rows(results), *read_published_rows()])
     make_folder(out)
     write_leaderboard(out / ROWS, Leaderboard(rows=rows))
-    page = render_leaderboard_page(rows, [one.result for one in results], out, left_out)
-    for name, text in ((MARKDOWN, render_leaderboard(rows, left_out)), (PAGE, page)):
+    page = render_leaderboard_page(rows, [one.result for one in results], out, skipped)
+    for name, text in ((MARKDOWN, render_leaderboard(rows, skipped)), (PAGE, page)):
         with atomic_file(out / name) as tmp:
             tmp.write_text(escape_controls(text, lines=True), encoding="utf-8")
     return [out / name for name in (PAGE, MARKDOWN, ROWS)]

@@ -9,13 +9,13 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 from robocas_ms3.evaluation.audit.run import hash_result
-from robocas_ms3.evaluation.leaderboard.entries import find_card, get_entry_name
+from robocas_ms3.evaluation.leaderboard.entries import find_card, get_entry_name, read_card
 from robocas_ms3.evaluation.leaderboard.markdown import (
     PUBLISHED_NOTE,
     RANK_NOTE,
     describe_cost,
     describe_data,
-    describe_left_out,
+    describe_skipped,
     format_audited,
     list_row_notes,
 )
@@ -37,24 +37,27 @@ _FILTERS = ("protocol", "task", "split", "track", "policy", "training data match
 
 
 def render_leaderboard_page(
-    rows: Sequence[LeaderboardRow], results: Sequence[Result], folder: Path, left_out: Sequence[str] = ()
+    rows: Sequence[LeaderboardRow], results: Sequence[Result], folder: Path, skipped: Sequence[str] = ()
 ) -> str:
     """Return the leaderboard as an HTML page.
 
     Args:
         rows: rows in the order of the page.
-        results: results of the entries; each has its stages and its model card.
+        results: results of the entries.
         folder: folder of the page; videos in `video_folder` are linked.
-        left_out: names of further results, which have a problem.
+        skipped: names of the results that are not shown because of a problem.
     """
     measured = [_render_row(row) for row in rows if not row.published]
     table = render_table(_HEADS, measured, "filtered")
     empty = '<p id="empty" hidden>No rows match these filters.</p>\n'
-    note = f'<p class="note">{escape(describe_left_out(left_out))}</p>\n' if left_out else ""
+    note = f'<p class="note">{escape(describe_skipped(skipped))}</p>\n' if skipped else ""
     head = f'<span id="count">{len(measured)}</span> of {len(measured)} rows. {escape(NOTE, quote=False)}'
     parts = [render_section("Results", head, note + _render_filters(measured) + table + empty)]
-    entries = "".join(_render_result(result, rows, folder) for result in results)
-    parts.append(render_section("Entries", "Stages, videos and model card of each entry.", entries))
+    entries: dict[Path, list[Result]] = {}
+    for result in results:
+        entries.setdefault(result.folder.parent, []).append(result)
+    content = "".join(_render_entry(found, rows, folder) for found in entries.values())
+    parts.append(render_section("Entries", "Stages, videos and model card of each entry.", content))
     if published := [row for row in rows if row.published]:
         heads = ("policy", "track", "task", "success by RoboCAS-v0's rule#")
         cells = [[escape(x) for x in (row.policy, row.track, row.task, _format_published(row))] for row in published]
@@ -102,23 +105,34 @@ def _render_row(row: LeaderboardRow) -> list[str]:
     ]
 
 
+def _render_entry(results: Sequence[Result], rows: Sequence[LeaderboardRow], folder: Path) -> str:
+    """Return the results of an entry and its model card, folded."""
+    name, card = get_entry_name(results[0].folder), find_card(results[0].folder)
+    parts = [_render_result(result, rows, folder) for result in results]
+    if card.is_file():
+        parts.append(_render_card(read_card(card)))
+    return f'<details class="entry">\n<summary>{escape(name)}</summary>\n{"".join(parts)}</details>\n'
+
+
 def _render_result(result: Result, rows: Sequence[LeaderboardRow], folder: Path) -> str:
-    """Return the stages of a result, links to its videos and the model card, folded."""
+    """Return the stages of a result, and links to its videos, folded."""
     entry, protocol = get_entry_name(result.folder), result.run.protocol
-    (policy,) = {row.name for row in rows if (row.entry, row.protocol) == (entry, protocol)} or {entry}
+    policy = next((row.name for row in rows if (row.entry, row.protocol) == (entry, protocol)), entry)
     videos = sorted(video_folder(folder, result).glob("*.mp4"))
     links = " ".join(f'<a href="{escape(one.relative_to(folder).as_posix())}">{one.stem}</a>' for one in videos)
     shown = f"<p>Videos of failed episodes: {links}</p>\n" if videos else ""
-    summary = f"<summary>{escape(entry)}, {escape(protocol)}</summary>"
-    card = find_card(result.folder)
-    text = _render_card(card.read_text(encoding="utf-8", errors="replace")) if card.is_file() else ""
-    filtered = f'data-policy="{escape(policy)}" data-protocol="{escape(protocol)}"'
-    return f"<details {filtered}>\n{summary}\n{render_stages(result)}{shown}{text}</details>\n"
+    names = f'data-policy="{escape(policy)}" data-protocol="{escape(protocol)}"'  # the filters read them
+    return f"<details {names}>\n<summary>{escape(protocol)}</summary>\n{render_stages(result)}{shown}</details>\n"
 
 
 def _render_card(text: str) -> str:
-    """Return a model card as HTML; HTML in the card is shown as text."""
-    return f'<div class="card">\n{MarkdownIt("js-default").render(text)}</div>\n'
+    """Return a model card as HTML; HTML and images in the card are shown as text."""
+    markdown = MarkdownIt("js-default").disable("image")
+    tokens = markdown.parse(text)
+    for token in tokens:
+        if token.type in ("heading_open", "heading_close"):
+            token.tag = f"h{min(int(token.tag[1]) + 2, 6)}"  # below the heading of the section
+    return f'<div class="card">\n{markdown.renderer.render(tokens, markdown.options, {})}</div>\n'
 
 
 def _format_published(row: LeaderboardRow) -> str:

@@ -76,7 +76,7 @@ def compare_results(results: Sequence[Result]) -> str:
     if differing:
         head += f" **Measured with different {' and '.join(differing)}.**"
     if any(run.policy.track != first.run.policy.track for run in others):
-        head += " **The policies have different tracks: they do not observe the same.**"
+        head += " **The policies have different tracks. Compare policies within a track.**"
     configs = sorted({first.outcomes[number].config for number in shared})
     rows = []
     pooled = len({(first.outcomes[number].task, first.outcomes[number].seed) for number in shared}) == len(shared)

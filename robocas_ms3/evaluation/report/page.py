@@ -207,7 +207,7 @@ def _render_failed_episodes(result: Result, folder: Path | None) -> str:
         f'<span id="count">{len(failed)}</span> of {format_count(len(result.outcomes), "episode")}. '
         f"Ended by: the time limit, a failure such as the target on the floor, or an error. {videos}"
     )
-    table = render_table(heads, rows, "filtered")
+    table = render_table(heads, rows, "filtered") + '<p id="empty" hidden>No episodes match these filters.</p>\n'
     return render_section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
 
 

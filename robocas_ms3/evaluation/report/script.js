@@ -2,22 +2,24 @@
 // Without this script all rows are shown.
 const filters = [...document.querySelectorAll(".filters select")];
 const rows = [...document.querySelectorAll("table.filtered tbody tr")];
-const entries = [...document.querySelectorAll("details[data-policy]")];
+const results = [...document.querySelectorAll("details[data-policy]")]; // of a leaderboard
+const entries = [...document.querySelectorAll("details.entry")];
+
+const getText = (row, column) => row.cells[column].firstChild?.textContent ?? "";
+const findColumn = (name) => filters.find(({ dataset }) => dataset.name === name)?.dataset.column;
 
 function show() {
-  let count = 0;
-  for (const row of rows) {
-    row.hidden = filters.some(
-      ({ value, dataset }) => value && row.cells[dataset.column].firstChild?.textContent !== value
-    );
-    count += !row.hidden;
-  }
-  document.querySelector("#count").textContent = count;
-  const empty = document.querySelector("#empty");
-  if (empty) empty.hidden = count > 0;
-  for (const entry of entries) {
-    entry.hidden = filters.some(({ value, dataset }) => value && (entry.dataset[dataset.name] ?? value) !== value);
-  }
+  const shown = rows.filter((row) => {
+    row.hidden = filters.some(({ value, dataset }) => value && getText(row, dataset.column) !== value);
+    return !row.hidden;
+  });
+  document.querySelector("#count").textContent = shown.length;
+  document.querySelector("#empty").hidden = shown.length > 0;
+  if (!results.length) return;
+  const [policy, protocol] = [findColumn("policy"), findColumn("protocol")];
+  const names = new Set(shown.map((row) => `${getText(row, policy)}\n${getText(row, protocol)}`));
+  for (const result of results) result.hidden = !names.has(`${result.dataset.policy}\n${result.dataset.protocol}`);
+  for (const entry of entries) entry.hidden = [...entry.querySelectorAll("details")].every(({ hidden }) => hidden);
 }
 
 for (const filter of filters) filter.addEventListener("input", show);

@@ -270,8 +270,12 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
     printed = capsys.readouterr().out
     assert "episode 1, recorded -> replayed: measures.path_length" in printed and "nothing was written" in printed
     assert (out / "results.json").read_bytes() == before
-    assert leaderboard.build(replace(build, skip_failed=True)) == 0
-    assert all(row.published for row in read_leaderboard(out / "results.json").rows)
+    assert leaderboard.build(replace(build, skip_errors=True)) == 1
+    assert (out / "results.json").read_bytes() == before  # no result is left
+    leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / "other" / "smoke"))
+    assert leaderboard.build(replace(build, skip_errors=True)) == 0
+    rows = read_leaderboard(out / "results.json").rows
+    assert {row.entry for row in rows if not row.published} == {"other"}
     assert "mine/smoke" in (out / "index.html").read_text() and "mine/smoke" in (out / "results.md").read_text()
 
 
@@ -284,6 +288,24 @@ def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeyp
     with pytest.raises(EvaluationError, match="two results of the same policy"):
         leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", envs=1))
     assert not (tmp_path / "page").exists()
+
+
+def test_a_result_whose_replay_crashes_is_skipped(folder, card, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    for name in ("mine", "other"):
+        leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / name / "smoke"))
+    replay_result = leaderboard.replay_result
+
+    def crash(result, *args, **kwargs):
+        if result.folder.parent.name == "mine":
+            raise EvaluationError("an episode could not be replayed", where=result.folder)
+        return replay_result(result, *args, **kwargs)
+
+    monkeypatch.setattr(leaderboard, "replay_result", crash)
+    build = leaderboard.Build(tmp_path / "entries", tmp_path / "page", skip_errors=True, envs=1)
+    assert leaderboard.build(build) == 0
+    assert "mine/smoke" in (tmp_path / "page" / "results.md").read_text()
+    assert "could not be replayed" in capsys.readouterr().out
 
 
 def test_an_unreadable_result_does_not_hide_the_problems_of_others(folder, card, tmp_path, capsys):
@@ -338,6 +360,10 @@ def test_bound_of_a_sample():
 def test_results_of_other_physics_or_versions_cannot_be_audited(folder, tmp_path):
     assert find_audit_obstacle(read_result(folder)) == ""
     record = json.loads((folder / RUN).read_text())
+    versions = {name: version.partition("+")[0] for name, version in record["versions"].items()}
+    for others in ({"torch": f"{versions['torch']}+cu999"}, {"robocas_ms3": "99"}):
+        (folder / RUN).write_text(json.dumps(record | {"versions": versions | others}))
+        assert find_audit_obstacle(read_result(folder)) == ""
     for changes, word in (({"backend": "gpu"}, "gpu"), ({"versions": {"sapien": "2.0"}}, "sapien 2.0")):
         (folder / RUN).write_text(json.dumps(record | changes))
         assert word in find_audit_obstacle(read_result(folder))

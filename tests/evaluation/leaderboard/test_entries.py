@@ -65,6 +65,21 @@ def test_a_result_on_a_protocol_that_is_not_bundled_is_refused(result, tmp_path)
     assert not (tmp_path / "entry").exists()
 
 
+def test_an_entry_has_no_links_and_the_name_of_its_protocol(result, tmp_path):
+    out, card, protocol = tmp_path / "entry" / "smoke", tmp_path / "card.md", load_protocol("smoke")
+    card.write_text("# Model card: mine\n")
+    add(Add((result.folder,), out=out, card=card))
+    assert entries.find_result_violations(read_result(out), protocol) == []
+    other = shutil.copytree(out, out.parent / "other")
+    assert any("another name" in text for text in entries.find_result_violations(read_result(other), protocol))
+    entries.find_card(out).unlink()
+    entries.find_card(out).symlink_to(card)
+    assert any("symbolic link" in text for text in entries.find_result_violations(read_result(out), protocol))
+    entries.find_card(out).unlink()
+    entries.find_card(out).write_bytes(b"\xff")
+    assert any("model card" in text for text in entries.find_result_violations(read_result(out), protocol))
+
+
 def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     protocol = load_protocol("smoke")
