@@ -118,8 +118,8 @@ class OutputFolder:
             self._compare(self.recorded, settings)
 
     def _compare(self, record: dict[str, Any], settings: Mapping[str, Any]) -> None:
-        now = json.loads(encode_json(settings, self.path))
-        before = self._kind.upgrade(record)
+        # JSON values, in which tuples are lists
+        now, before = (json.loads(encode_json(one, self.path)) for one in (settings, self._kind.upgrade(record)))
         changes = [change for key, value in now.items() for change in list_setting_changes(before.get(key), value, key)]
         if changes:
             more = len(changes) - _SHOWN_CHANGES

@@ -183,6 +183,15 @@ def test_select_runs_in_the_episodes_of_pick_in_paper_v1_and_the_result_records_
         list(make_session(evaluation.folder, "noop", protocol="paper-v1", tasks=("pick",), episodes=2).run())
 
 
+def test_an_evaluation_with_action_noise_is_continued(made, tmp_path):
+    for count in (1, 2):
+        settings = {"protocol": "paper-v1", "tasks": ("pick",), "episodes": count, "action_noise": (20.0, 8.0)}
+        list(make_session(tmp_path / "out", **settings).run())
+        assert len(read_result(tmp_path / "out").outcomes) == count
+    with pytest.raises(OutputExistsError, match="action_noise"):
+        list(make_session(tmp_path / "out", **settings | {"action_noise": (20.0, 9.0)}).run())
+
+
 def test_other_protocols_have_no_alias_of_select_and_pick_cannot_run_twice():
     with pytest.raises(EvaluationError, match="no episodes of this task .*found select"):
         load_protocol("clutter-v1").select_episodes(EvaluationSettings(("select",)))
