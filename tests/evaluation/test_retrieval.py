@@ -84,6 +84,20 @@ def test_moves_after_the_target_was_held_do_not_count():
     assert [move.object for move in found.moved] == ["cup"]
 
 
+def test_moves_after_a_forgotten_grasp_count():
+    heap: Any = Heaps()
+    retrieval = RetrievalTracker(heap)
+    retrieval.reset(torch.tensor([0]))
+    retrieval.update(heap.make_state(held=True))
+    retrieval.end_step()
+    heap.disturbed[0, CUP] = True
+    retrieval.update(heap.make_state())
+    assert retrieval.compute_record()[0, CUP].tolist() == [0, 1, 0]
+    retrieval.forget_grasp()
+    retrieval.update(heap.make_state())
+    assert retrieval.compute_record()[0, CUP, 0] == 2
+
+
 def test_no_score_if_the_target_was_never_held():
     found = Retrieval.from_record(record_of({CUP: 10}), NAMES, held_at=None, cleared=False)
     assert (found.score, found.left, len(found.moved)) == (None, 0, 1)

@@ -244,8 +244,8 @@ def _replay_checkpoints(
 
 def _replace_stages(outcome: Outcome, stages: Mapping[str, tuple[int, int] | None], control_dt: float) -> Outcome:
     """Return an outcome with other times of some stages, given as policy step and control step (`CheckpointEnv`)."""
-    flags = {**outcome.flags, **{name: again and again[0] for name, again in stages.items()}}
-    seconds = {name: again and round(again[1] * control_dt, 4) for name, again in stages.items()}
+    flags = {**outcome.flags, **{name: None if at is None else at[0] for name, at in stages.items()}}
+    seconds = {name: None if at is None else round(at[1] * control_dt, 4) for name, at in stages.items()}
     failure_stage = find_failure_stage(flags, outcome.error, TASKS[outcome.task].stages)
     return replace(outcome, flags=flags, flag_seconds={**outcome.flag_seconds, **seconds}, failure_stage=failure_stage)
 

@@ -93,8 +93,8 @@ class CheckpointEnv:
     def step(self, actions: Any) -> Any:
         results, calls = self._env.step(actions), {}
         for env, (episode, step) in self._policy.progress.items():
-            for stage, again in (lost := self.lost_stages.setdefault(episode, {})).items():
-                if again is None and results[-1][stage][env]:
+            for stage, reached_again in (lost := self.lost_stages.setdefault(episode, {})).items():
+                if reached_again is None and results[-1][stage][env]:
                     lost[stage] = step, int(results[-1]["elapsed_steps"][env])
             if episode not in self._checkpoints:
                 self._checkpoints[episode] = self._result.read_checkpoints(episode)

@@ -14,7 +14,7 @@ from mani_skill.utils.structs import Pose
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import EvaluationError, VectorEnvError
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.results.metrics import read_metric
+from robocas_ms3.evaluation.results.metrics import EpisodeMetrics, read_metric
 from robocas_ms3.evaluation.rollouts.action_wrapper import PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.tasks.vector import make_vec
 
@@ -102,7 +102,9 @@ def test_poses_and_joints_return_to_a_checkpoint_but_velocities_do_not():
     assert (after[:bodies] != before).any()
 
 
-def test_stages_that_a_checkpoint_lacks_are_taken_back():
+def test_stages_that_a_checkpoint_lacks_are_lost(monkeypatch):
+    forgotten = []
+    monkeypatch.setattr(EpisodeMetrics, "forget_grasp", lambda metrics: forgotten.append(metrics))
     env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas"), "timed", checkpoints=True)
     env.reset(seed=3)
     *_, info = env.step(along(0.02))
@@ -122,6 +124,9 @@ def test_stages_that_a_checkpoint_lacks_are_taken_back():
     assert not stages["picked_any"].any()
     env.restore_checkpoint(picked, 0.0)
     assert not stages["picked_any"].any()  # only the simulation reaches a stage
+    assert not forgotten
+    stages["target_grasped"][:] = True
+    assert env.restore_checkpoint(checkpoint, 0.0)[1] == ["target_grasped"] and len(forgotten) == 1
 
 
 def qpos_in(base: Any, checkpoint: np.ndarray) -> np.ndarray:
