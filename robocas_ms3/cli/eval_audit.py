@@ -98,8 +98,8 @@ def replay_result(
     """Replay episodes of a result with a progress bar; print notes and differences (`run_audit`)."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.core.source_hash import hash_source
     from robocas_ms3.evaluation.audit.run import AuditSummary, list_other_processors, run_audit
-    from robocas_ms3.evaluation.results.run_record import hash_source
 
     if models := list_other_processors(result):
         print_line(f"note: made on another model of processor, so contacts may diverge: {', '.join(models)}")

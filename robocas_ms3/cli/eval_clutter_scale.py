@@ -51,7 +51,8 @@ def clutter_scale(cfg: PlacePolicies) -> int:
     from robocas_ms3.evaluation.results.result_files import load_protocol_of
 
     results = read_evaluations(cfg.folders)
-    study = make_study(results, load_protocol_of(results[0], cfg.protocol), fit=cfg.fit)
+    protocol = load_protocol_of(results[0], cfg.protocol)
+    study = make_study(results, protocol, fit=cfg.fit)
     make_folder(cfg.out)
     study.write(cfg.out)
     write_curves(study, cfg.out / "clutter_scale.png")
@@ -79,8 +80,12 @@ def clutter_scale(cfg: PlacePolicies) -> int:
         "difficulty: 0 is the easiest scene of the protocol, 10 the hardest; none: success does not fall with the "
         "difficulty. AUC: probability that a failed scene is more difficult than a solved one; 0.5: no relation"
     )
+    hashes = ", ".join(f"{name} {digest[:8]}" for name, digest in study.file_hashes.items())
     if study.is_fixed:
-        print_line("The scale is the fixed one of the protocol; to fit it to these results, pass --fit.")
+        print_line(f"scale: the fixed one of {protocol.rules.name} (sha256: {hashes}); to fit another, pass --fit")
+    else:
+        print_line(f"scale: fitted to these results on {protocol.rules.name} (sha256: {hashes})")
+    print_line("not audited: the outcomes are consistent with the protocol, but no stored actions were replayed")
     print_line(f"wrote {SCALE_FILE}, curves.json and clutter_scale.png to {cfg.out}")
     return 0
 

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 class Add:
     """Add a result to an entry, a folder with the results and the model card of a policy.
 
-    The copy has all outcomes, and the stored actions of 50 episodes that the protocol fixes. The result is first
-    checked as in `robocas eval verify`. Whole tasks or splits of the protocol may be missing. Every task and split in
-    the result needs all its episodes.
+    The copy has all outcomes, and the stored actions and checkpoints of 50 episodes, which the protocol and the tasks
+    and splits of the result fix. The result is first checked as in `robocas eval verify`. Whole tasks or splits of the
+    protocol may be missing. Every task and split in the result needs all its episodes.
 
     Example: robocas leaderboard add eval/pick --out leaderboard/mine/paper-v1 --card card.md
     """

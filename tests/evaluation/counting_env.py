@@ -9,10 +9,11 @@ import numpy as np
 from robocas_ms3.core.errors import VectorEnvCrashError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.results.metrics import SUMS
+from robocas_ms3.evaluation.rollouts.action_wrapper import CHECKPOINT
 from robocas_ms3.evaluation.rollouts.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
 from robocas_ms3.robots.camera_models import CameraModel
 
-STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted")
+STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
 BREAKS = 13.0  # an action with this number raises
 POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
 
@@ -25,7 +26,12 @@ class CountingEnv:
         goal: goal of all envs, or one per env; None: the seed of the episode.
         steps: whether steps are counted.
         config: name of the configuration, for tests.
+
+    Attributes:
+        records_checkpoints: whether the infos have checkpoints: states with the sum of each env.
     """
+
+    records_checkpoints = False
 
     def __init__(self, num_envs: int = 1, goal: Any = 5.0, *, steps: bool = False, config: str = "") -> None:
         self.num_envs, self.config, self._goal, self._count_steps = num_envs, config, goal, steps
@@ -83,7 +89,8 @@ class CountingEnv:
         sums[:, 0] = self.sums  # path_length
         done = self.sums >= (self.seed_of if self._goal is None else self._goal)
         flags = {**{stage: self.sums > 1 for stage in STAGES}, "success": done, "fail": no, "success_v0": no}
-        return {"sums": sums, **flags, "elapsed_steps": self.elapsed.copy()}
+        checkpoint = {CHECKPOINT: sums[:, :1].copy()} if self.records_checkpoints else {}
+        return {"sums": sums, **flags, "elapsed_steps": self.elapsed.copy(), **checkpoint}
 
 
 class CrashingEnv(CountingEnv):

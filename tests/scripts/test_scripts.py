@@ -277,6 +277,24 @@ def test_help_is_the_first_comment(tmp_path, words):
     assert "set -euo" not in done.stdout
 
 
+def test_ci_names_the_audit_that_exceeds_its_time_limit(tmp_path):
+    """Incident: the run ended with exit status 124 and no message."""
+    root = tmp_path / "clone"
+    shutil.copytree(ROOT / ".ci", root / ".ci")
+    stubs = {"scripts/test.sh": "", "scripts/setup.sh": "", ".venv-numpy1/bin/python": ""}
+    for name, lines in {**stubs, "scripts/audit_entries.sh": "exit 124"}.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(f"#!/bin/sh\n{lines}\n")
+        (root / name).chmod(0o755)
+    settings = ["-c", "user.name=test", "-c", "user.email=test", "-c", "commit.gpgsign=false"]
+    for words in (["init"], ["add", "--all"], ["commit", "--message", "first"]):
+        subprocess.run(["git", *settings, *words], cwd=root, check=True, capture_output=True)
+    env = {**os.environ, "AUDIT_BASE": "HEAD"}
+    done = subprocess.run(["bash", root / ".ci" / "run"], env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 124
+    assert "300 s" in done.stderr and "scripts/audit_entries.sh HEAD" in done.stderr
+
+
 def test_changed_entries_are_audited(tmp_path):
     root, stub = tmp_path / "clone", tmp_path / "robocas"
     stub.write_text(STUB)

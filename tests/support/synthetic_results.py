@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results.outcomes import Outcome, find_failure_stage
+from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol, ProtocolEpisode
+from robocas_ms3.evaluation.results.outcomes import (
+    Checkpoints,
+    Outcome,
+    Retrieval,
+    compute_order_score,
+    find_failure_stage,
+)
 from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, Result, read_result
-from robocas_ms3.evaluation.results.stored_episodes import hash_actions, write_actions
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions, write_actions, write_checkpoints
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
 RUN_OF = {
@@ -74,20 +80,40 @@ def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
     return read_result(folder)
 
 
-def of_protocol(folder: Path, protocol: LoadedProtocol) -> Result:
-    """Write a valid result in which every episode of a protocol succeeded."""
-    outcomes, v0_steps = [], protocol.rules.max_v0_steps
+def of_protocol(folder: Path, protocol: LoadedProtocol, failed: Collection[int] = (), **run: Any) -> Result:
+    """Write a valid result with actions and checkpoints of all episodes of a protocol.
+
+    All episodes succeeded, except those with numbers in ``failed``, which ended with the flag ``fail`` after two
+    stages. Other arguments replace values of ``run.json``.
+    """
+    outcomes = [_outcome_of_protocol(one, protocol, has_failed=one.episode in failed) for one in protocol.episodes]
+    packs = {protocol.rules.pack: protocol.rules.pack_hash}
+    settings = {"protocol": protocol.rules.name, "protocol_hash": protocol.hash, "pack_hashes": packs}
+    result = write(folder, outcomes, **settings, **run)
+    for made in outcomes:
+        steps, states = np.array([made.steps], np.int32), np.full((1, 1), made.episode, np.float32)
+        write_checkpoints(folder, made.episode, Checkpoints(steps, states))
+    return result
+
+
+def _outcome_of_protocol(one: ProtocolEpisode, protocol: LoadedProtocol, *, has_failed: bool) -> Outcome:
     more: dict[str, tuple[str, ...]] = {
         "search": ("obstacles_cleared", "cleared_at_reset"),
         "open_pick": ("furniture_opened",),
     }
-    for one in protocol.episodes:
-        made = outcome(one.episode, task=one.task, config=one.config, seed=one.seed, split=one.split, p_vis=one.p_vis)
-        flags, seconds = (of | dict.fromkeys(more.get(one.task, ())) for of in (made.flags, made.flag_seconds))
-        if v0_steps is not None:  # the episode ends after this number of steps with RoboCAS-v0's success
-            flags["success_v0"] = made.steps - v0_steps + 1
-            seconds["success_v0"] = flags["success_v0"] / 20
-        outcomes.append(replace(made, flags=flags, flag_seconds=seconds))
-    packs = {protocol.rules.pack: protocol.rules.pack_hash}
-    name = protocol.rules.name
-    return write(folder, outcomes, protocol=name, protocol_hash=protocol.hash, pack_hashes=packs)
+    values = {"task": one.task, "config": one.config, "seed": one.seed, "split": one.split, "p_vis": one.p_vis}
+    if has_failed:
+        values |= {"steps": 30, "seconds": 1.5}
+    made = outcome(one.episode, 2 if has_failed else 7, **values)
+    never = dict.fromkeys(more.get(one.task, ()))
+    flags, seconds = made.flags | never, made.flag_seconds | never
+    if has_failed:
+        flags["fail"], seconds["fail"] = made.steps, made.seconds
+    elif (v0_steps := protocol.rules.max_v0_steps) is not None:  # success by RoboCAS-v0's rule ends the episode
+        flags["success_v0"] = made.steps - v0_steps + 1
+        seconds["success_v0"] = flags["success_v0"] / 20
+    retrieval = None
+    if one.task == "search":
+        retrieval = Retrieval([], [], 0, compute_order_score([], 0, flags["target_grasped"]))
+    stage = find_failure_stage(flags)
+    return replace(made, flags=flags, flag_seconds=seconds, retrieval=retrieval, failure_stage=stage)

@@ -11,6 +11,7 @@ from typing import Any
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
+from robocas_ms3.core.source_hash import hash_source
 from robocas_ms3.core.workers import Limits, WorkerPool, hide_cuda, use_one_torch_thread
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.demos.forked_processes import ForkedProcessError, find_reason_not_to_fork
@@ -82,7 +83,7 @@ def measure_seeds(
     The folder ``out`` gets ``scenes.jsonl`` with one line per scene, in the order in which they were measured.
 
     Args:
-        settings: settings of the scenes; a folder with other settings or package versions is not continued.
+        settings: settings of the scenes; a folder of other settings, package versions or source code is not continued.
         seeds: seeds of the scenes.
         out: output folder.
         jobs: number of processes, which has no effect on the results.
@@ -90,11 +91,11 @@ def measure_seeds(
         on_start: called with the number of seeds that were measured earlier.
 
     Raises:
-        OutputExistsError: ``out`` was written with other settings, or by another command.
+        OutputExistsError: ``out`` was written with other settings or other code, or by another command.
         RobocasError: the configuration is invalid, or its scenes have no measure of difficulty.
     """
     settings.check()
-    record = {**asdict(settings), "versions": package_versions()}
+    record = {**asdict(settings), "versions": package_versions(), "source_hash": hash_source()}
     with OutputFolder(out, OUTPUT, record, overwrite=overwrite) as output:
         output.start(record)
         file = JsonLinesFile[SceneDifficulty](output.path / SCENES, SceneDifficulty)

@@ -17,6 +17,7 @@ from scipy.stats import hypergeom
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
+from robocas_ms3.core.source_hash import hash_source
 from robocas_ms3.evaluation.audit.differences import (
     list_deviations,
     list_differences,
@@ -30,7 +31,6 @@ from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.results.run_record import (
     describe_machine,
     get_package_versions,
-    hash_source,
     is_same_processor,
 )
 from robocas_ms3.evaluation.rollouts.rollout import count_checkpoint_steps

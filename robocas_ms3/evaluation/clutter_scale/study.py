@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.assets.pack import sha256
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.evaluation.clutter_scale.curves import SuccessCurve, fit_success_curve
@@ -23,7 +24,9 @@ from robocas_ms3.evaluation.clutter_scale.item_response import (
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales, write_scales
 from robocas_ms3.evaluation.clutter_scale.task_results import MIN_EPISODES, TaskResults, describe_policy, split_by_task
 from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES
 from robocas_ms3.evaluation.results.result_files import Result
+from robocas_ms3.evaluation.results.verify import check_consistency
 
 MIN_POLICIES = 2
 
@@ -82,20 +85,29 @@ class ClutterStudy:
         is_fixed: whether the scales are those of the protocol; otherwise they were fitted to the results.
         tasks: scale and policies by task.
         left_out: by task without a scale, the numbers of successes and episodes of each policy.
+        file_hashes: SHA-256 of files in the folder of the protocol, by name: `DIFFICULTIES`, and `SCALE_FILE` if the
+            scales are fixed.
     """
 
     is_fixed: bool
     tasks: dict[str, TaskStudy]
     left_out: dict[str, dict[str, tuple[int, int]]]
+    file_hashes: dict[str, str]
 
     def write(self, folder: Path) -> None:
-        """Write the scales as `SCALE_FILE`, and the policies as ``curves.json``; infinite limits are null."""
+        """Write the scales as `SCALE_FILE`, and the policies as ``curves.json``; infinite limits are null.
+
+        ``curves.json`` also has the SHA-256 of the files with the difficulties and the scales. If the scales are
+        fitted, that of the scales is the hash of the written `SCALE_FILE`.
+        """
         scales = {name: task.scale for name, task in self.tasks.items()}
         write_scales(folder / SCALE_FILE, scales, {name: task.fitted for name, task in self.tasks.items()})
         content = {name: {**asdict(task), "mean_auc": task.mean_auc} for name, task in self.tasks.items()}
         for task in content.values():
             del task["scale"]
-        write_json(folder / "curves.json", _to_json({"tasks": content, "left_out": self.left_out}))
+        hashes = self.file_hashes if self.is_fixed else {**self.file_hashes, SCALE_FILE: sha256(folder / SCALE_FILE)}
+        values = {"is_fixed": self.is_fixed, "sha256": hashes, "tasks": content, "left_out": self.left_out}
+        write_json(folder / "curves.json", _to_json(values))
 
 
 def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool = False) -> ClutterStudy:
@@ -105,15 +117,19 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
     to the policies that succeed in 10 to 90 % of their episodes of the task. Scenes without a known number of removals
     are left out.
 
+    Outcomes are checked for consistency (`check_consistency`); stored actions are neither required nor checked.
+
     Raises:
-        EvaluationError: a result has another protocol, two results have the same policy, noise and task, the fixed
-            scale is damaged or lacks the tasks of the results, or no task has two policies between 10 and 90 %.
+        EvaluationError: a result has another protocol or violations, two results have the same policy, noise and task,
+            the fixed scale is damaged or lacks the tasks of the results, or no task has two policies between 10 and
+            90 %.
     """
     for result in results:
         if result.run.protocol_hash != protocol.hash:
             found = f"{result.run.protocol}, hash {result.run.protocol_hash[:16]}"
             expected = f"{protocol.rules.name}, hash {protocol.hash[:16]}"
             raise EvaluationError("result of another protocol", where=result.folder, expected=expected, found=found)
+        check_consistency(result, protocol, stored=())
     folders: dict[tuple[str, str], Path] = {}
     for result in results:
         for task in sorted({outcome.task for outcome in result.outcomes.values()}):
@@ -142,7 +158,9 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
         wanted = f"{MIN_POLICIES} policies with 10 to 90 % success in at least {MIN_EPISODES} episodes of a task"
         found = "; ".join(f"{task}: {describe_counts(counts)}" for task, counts in left_out.items())
         raise EvaluationError(what, expected=wanted, found=found, fix="Add results of other policies.")
-    return ClutterStudy(fixed is not None, tasks, left_out)
+    names = [DIFFICULTIES] if fixed is None else [DIFFICULTIES, SCALE_FILE]
+    file_hashes = {name: sha256(protocol.folder / name) for name in names}
+    return ClutterStudy(fixed is not None, tasks, left_out, file_hashes)
 
 
 def describe_counts(counts: Mapping[str, tuple[int, int]]) -> str:

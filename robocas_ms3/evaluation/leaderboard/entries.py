@@ -23,7 +23,7 @@ from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
 from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results.result_files import RUN, Result, write_outcomes
-from robocas_ms3.evaluation.results.stored_episodes import write_actions, write_checkpoints
+from robocas_ms3.evaluation.results.stored_episodes import find_checkpoints_file, write_actions, write_checkpoints
 from robocas_ms3.evaluation.results.verify import check_consistency, find_violations
 
 CARD = "README.md"
@@ -33,21 +33,21 @@ SAMPLE_SIZE = 50
 """Number of episodes of a result whose actions are in an entry."""
 
 
-def choose_sample(protocol: LoadedProtocol, configs: Collection[str]) -> list[int]:
+def choose_sample(protocol: LoadedProtocol, groups: Collection[tuple[str, str]]) -> list[int]:
     """Return the numbers of the episodes whose actions are in an entry, in ascending order.
 
-    Protocol and configurations fix the sample, so that the author of a result cannot choose it: it has the episodes
-    with the smallest hashes of protocol and number.
+    The sample has the episodes with the smallest hashes of protocol and number. The author of a result chooses its
+    tasks and splits, but cannot choose episodes of these.
 
     Args:
         protocol: protocol of the result.
-        configs: names of the evaluated configurations.
+        groups: task and split of the evaluated episodes, as in the protocol.
     """
 
     def compute_hash(number: int) -> bytes:
         return hashlib.sha256(f"{protocol.hash} {number}".encode()).digest()
 
-    numbers = [episode.episode for episode in protocol.episodes if episode.config in configs]
+    numbers = [episode.episode for episode in protocol.episodes if (episode.task, episode.split) in groups]
     return sorted(sorted(numbers, key=compute_hash)[:SAMPLE_SIZE])
 
 
@@ -64,15 +64,32 @@ def find_results(entry: Path) -> list[Path]:
     return folders
 
 
+def find_groups(result: Result, protocol: LoadedProtocol) -> set[tuple[str, str]]:
+    """Return the task and split, as in the protocol, of the episodes of a result; each pair gives a row."""
+    return {(one.task, one.split) for one in protocol.episodes if one.episode in result.outcomes}
+
+
 def count_missing(result: Result, protocol: LoadedProtocol) -> int:
-    """Return the number of episodes that a result lacks among those of its configurations."""
-    configs = {outcome.config for outcome in result.outcomes.values()}
-    return sum(one.config in configs and one.episode not in result.outcomes for one in protocol.episodes)
+    """Return the number of episodes that a result lacks among those of its tasks and splits."""
+    groups = find_groups(result, protocol)
+    return sum((one.task, one.split) in groups and one.episode not in result.outcomes for one in protocol.episodes)
 
 
 def list_stored_episodes(result: Result, protocol: LoadedProtocol) -> list[int]:
     """Return the numbers of the episodes of a result in an entry whose actions must be stored."""
-    return choose_sample(protocol, {outcome.config for outcome in result.outcomes.values()})
+    return choose_sample(protocol, find_groups(result, protocol))
+
+
+def list_missing_checkpoints(result: Result, protocol: LoadedProtocol) -> list[int]:
+    """Return the numbers of the episodes with stored actions that lack checkpoints.
+
+    None if the backend stores no checkpoints. Episodes that ended with an error need none.
+    """
+    if result.run.backend != "processes":
+        return []
+    outcomes = [result.outcomes[one] for one in list_stored_episodes(result, protocol) if one in result.outcomes]
+    numbers = [outcome.episode for outcome in outcomes if not outcome.error]
+    return [one for one in numbers if not find_checkpoints_file(result.folders.get(one, result.folder), one).exists()]
 
 
 def find_card(folder: Path) -> Path:
@@ -89,7 +106,8 @@ def find_result_violations(result: Result, protocol: LoadedProtocol) -> list[str
     """Return one text per violation in a result of an entry (`find_violations`)."""
     found = find_violations(result, protocol, is_complete=False, stored=list_stored_episodes(result, protocol))
     if missing := count_missing(result, protocol):
-        found.append(f"{format_count(missing, 'episode')} of its configurations missing")
+        found.append(f"{format_count(missing, 'episode')} of its tasks and splits missing")
+    found += [f"episode {number}: no checkpoints" for number in list_missing_checkpoints(result, protocol)]
     try:
         make_rows(result, protocol)
     except EvaluationError as error:
@@ -115,22 +133,26 @@ def write_result(
     """Write a result into a folder of an entry, and return the numbers of the episodes of the sample.
 
     Args:
-        result: the result, with all episodes of its configurations.
+        result: the result, with all episodes of its tasks and splits.
         protocol: its protocol.
         out: new folder, such as ``leaderboard/keyframe/paper-v1``; written atomically.
         card: model card to copy into the entry; None: the entry keeps its card.
         overwrite: whether to replace an existing result.
 
     Raises:
-        EvaluationError: the result has violations (`find_violations`) or lacks episodes of its configurations, or
-            ``out`` has another name than the protocol.
+        EvaluationError: the result has violations (`find_violations`), lacks episodes of its tasks and splits or
+            checkpoints, or ``out`` has another name than the protocol.
         OutputExistsError: ``out`` exists, the entry has another model card, or the folder of the entry has no result,
             but a README.md.
     """
     check_consistency(result, protocol)
     if missing := count_missing(result, protocol):
-        what, fix = "the result lacks episodes of its configurations", "Evaluate all episodes."
+        what, fix = "the result lacks episodes of its tasks and splits", "Evaluate all episodes."
         found = f"{format_count(missing, 'episode')} missing"
+        raise EvaluationError(what, where=result.folder, found=found, fix=fix)
+    if without := list_missing_checkpoints(result, protocol):
+        what, fix = "the result lacks checkpoints", "Evaluate again with --overwrite."
+        found = f"{format_count(len(without), 'episode')} without checkpoints, the first: {without[0]}"
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
     if out.absolute().name != protocol.rules.name:
         what, fix = "the folder of the result has another name than its protocol", "See robocas leaderboard add --help."

@@ -74,7 +74,7 @@ class LeaderboardRow(StrictModel):
         rank: 1 plus the number of comparable policies that are significantly better; None: not ranked.
         rank_p_value: adjusted p-value of the comparison with the next policy; None: not compared (`ranks.Rank`).
         backend, versions: backend and package versions of the evaluation.
-        source_hash: hash of the source code of robocas_ms3 (`run_record.hash_source`); empty: unknown.
+        source_hash: hash of the source code of robocas_ms3 (`source_hash.hash_source`); empty: unknown.
     """
 
     policy: str
@@ -150,11 +150,15 @@ def get_row_order(row: LeaderboardRow) -> tuple:
 
 
 def find_seen_row(row: LeaderboardRow, rows: Iterable[LeaderboardRow]) -> LeaderboardRow | None:
-    """Return the row of the split `SEEN` of the same policy and conditions; None: there is none, or it is this row."""
+    """Return the row of the split `SEEN` of the same entry, policy and conditions.
+
+    None: there is none, or it is this row.
+    """
 
     def key(one: LeaderboardRow) -> tuple:
         conditions = one.calibration, tuple(one.differences), one.backend
-        return one.policy, one.weights, one.training, one.protocol, one.protocol_hash, one.task, *conditions
+        evaluated = one.protocol, one.protocol_hash, one.task
+        return one.entry, one.policy, one.weights, one.training, *evaluated, *conditions
 
     if row.published or row.split == SEEN:
         return None

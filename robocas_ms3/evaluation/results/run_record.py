@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import re
 from importlib.metadata import version
@@ -11,7 +10,6 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-import robocas_ms3
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -71,7 +69,7 @@ class RunRecord(BaseModel):
             such as objects; None: unknown, or the policy was not trained.
         backend: ``processes`` or ``gpu``.
         versions: package versions by name.
-        source_hash: hash of the source code of robocas_ms3 (`hash_source`); empty: unknown.
+        source_hash: hash of the source code of robocas_ms3 (`source_hash.hash_source`); empty: unknown.
         pack_hashes: sha256 of the manifests of the object packs by name.
         machine: processor and Python version of the machine (`describe_machine`).
         merged_from: the partial results, if the result was merged.
@@ -123,18 +121,6 @@ class RunRecord(BaseModel):
 def get_package_versions() -> dict[str, str]:
     """Return the installed versions, by name, of the packages that can change a result."""
     return {name: version(name) for name in _PACKAGES}
-
-
-def hash_source() -> str:
-    """Return the hex SHA-256 of all Python files of robocas_ms3, with their paths.
-
-    It tells apart states of a checkout that have the same version.
-    """
-    root, digest = Path(robocas_ms3.__file__).parent, hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
-    return digest.hexdigest()
 
 
 def describe_machine() -> dict[str, str]:

@@ -19,10 +19,20 @@ from robocas_ms3.evaluation.results.result_files import Result
 from robocas_ms3.evaluation.results.run_record import RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
-# Flags of the built-in tasks. Custom tasks may have other stages.
-_FLAGS = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "success", "fail")
+# Flags of the built-in tasks, whose configurations always have a basket. Custom tasks may have other stages.
+_FLAGS = (
+    "reached_any",
+    "picked_any",
+    "reached_target",
+    "target_grasped",
+    "target_lifted",
+    "target_in_basket",
+    "success",
+    "fail",
+    "success_v0",
+)
 _FLAGS_OF_TASK = {"search": ("obstacles_cleared", "cleared_at_reset"), "open_pick": ("furniture_opened",)}
-# Pairs (a, b) of flags of the built-in tasks with a basket: if b held, a held at the same step or before, by their
+# Pairs (a, b) of flags of the built-in tasks: if b held, a held at the same step or before, by their
 # definitions in `tasks.success`.
 _IMPLIED = (
     ("reached_any", "reached_target"),
@@ -49,8 +59,8 @@ def find_violations(
         is_complete: whether the result must have all episodes of the protocol.
         stored: numbers of the episodes whose actions must be stored; None: all. The others need the hash only.
 
-    Violations are another hash, missing or unknown episodes, values that contradict the protocol or other values, and
-    stored actions or checkpoints that are missing or do not fit their episode.
+    Violations are another hash, missing or unknown episodes, values that contradict the protocol or other values,
+    missing stored actions, and stored actions or checkpoints that do not fit their episode. Checkpoints may be missing.
     """
     run, rules, count = result.run, protocol.rules, len(protocol.episodes)
     found = []
@@ -133,17 +143,19 @@ def _find_outcome_violations(
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
     if late:
         yield f"flags: {', '.join(late)} first held after the last step, expected at most {outcome.steps}"
-    for before, after in _IMPLIED if is_builtin and "target_in_basket" in flags else ():
+    for before, after in _IMPLIED if is_builtin else ():
         at, later = flags.get(before), flags.get(after)
-        if before in flags and later is not None and (at is None or at > later):
+        if later is not None and (at is None or at > later):
             yield f"flags: {after} held at step {later}, expected {before} at the same step or before, found {at}"
     yield from _find_time_violations(outcome)
-    yield from _find_retrieval_violations(outcome)
+    yield from _find_retrieval_violations(outcome, is_required=episode.task == "search" and not outcome.error)
 
 
 def _find_length_violations(outcome: Outcome, rules: Protocol, limit: int | None) -> Iterator[str]:
     """Yield how the number of steps contradicts the end conditions; ``limit``: maximum number of steps."""
     flags, steps = outcome.flags, format_count(outcome.steps, "step")
+    if not outcome.error and not outcome.steps:
+        yield f"{steps}, expected at least 1 without an error"
     if limit is not None and outcome.steps > limit:
         yield f"{steps}, expected at most {limit} by the rules of the protocol"
     for name in rules.ends_on:
@@ -188,9 +200,11 @@ def _find_time_violations(outcome: Outcome) -> Iterator[str]:
         yield f"flag_seconds: {', '.join(late)} first held after the end of the episode at {outcome.seconds:g} s"
 
 
-def _find_retrieval_violations(outcome: Outcome) -> Iterator[str]:
+def _find_retrieval_violations(outcome: Outcome, *, is_required: bool) -> Iterator[str]:
     order = outcome.retrieval
     if order is None:
+        if is_required:
+            yield "retrieval: missing; expected in search"
         return
     if "obstacles_cleared" not in outcome.flags:
         yield "retrieval: unexpected; expected only in tasks with the stage obstacles_cleared"

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
+from robocas_ms3.core.source_hash import hash_source
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation.policy import (
@@ -30,7 +31,7 @@ from robocas_ms3.evaluation.policy import (
 from robocas_ms3.evaluation.protocols.protocol import ProtocolEpisode, load_protocol
 from robocas_ms3.evaluation.results.outcomes import EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.results.result_files import append_episode, open_result
-from robocas_ms3.evaluation.results.run_record import RunRecord, describe_machine, get_package_versions, hash_source
+from robocas_ms3.evaluation.results.run_record import RunRecord, describe_machine, get_package_versions
 from robocas_ms3.evaluation.results.stored_episodes import hash_actions
 from robocas_ms3.evaluation.rollouts.action_wrapper import (
     MOTION_STEPS,

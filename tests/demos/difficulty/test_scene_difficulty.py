@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import ConfigError, OutputExistsError
+from robocas_ms3.demos.difficulty import difficulty_file
 from robocas_ms3.demos.difficulty.difficulty_file import DifficultySettings, measure_seeds, read_difficulties
 from robocas_ms3.demos.difficulty.records import RemovalLimits
 from robocas_ms3.demos.difficulty.scene_difficulty import measure_gap
@@ -31,7 +32,7 @@ def test_gap_is_the_mean_of_the_three_nearest_objects():
     assert measure_gap(target, []) == pytest.approx(0.2)
 
 
-def test_scenes_are_measured_stored_and_not_measured_again(tmp_path: Path):
+def test_scenes_are_measured_stored_and_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     settings = make_settings()
     results = list(measure_seeds(settings, [FREE, BLOCKED], tmp_path / "out", jobs=2))
     assert sorted(result.seed for result in results) == [FREE, BLOCKED]
@@ -51,6 +52,9 @@ def test_scenes_are_measured_stored_and_not_measured_again(tmp_path: Path):
     assert measured == [2]
     with pytest.raises(OutputExistsError):
         list(measure_seeds(make_settings(**{"objects.count": 4}), [FREE], tmp_path / "out"))
+    monkeypatch.setattr(difficulty_file, "hash_source", lambda: "0" * 64)  # of a changed skill
+    with pytest.raises(OutputExistsError):
+        list(measure_seeds(settings, [FREE], tmp_path / "out"))
 
 
 def test_first_removal_of_the_scripted_policy_is_measured_in_search(tmp_path: Path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from counting_env import CrashingEnv
+from counting_env import CountingEnv, CrashingEnv
 
 from robocas_ms3.cli import leaderboard
 from robocas_ms3.cli.eval_audit import Audit, audit
@@ -52,6 +52,12 @@ class CountingPolicy:
         actions = np.zeros((len(observations.envs), 7), np.float32)
         actions[:, 0] = [self._numbers[env] + 1 for env in observations.envs.tolist()]
         return actions
+
+
+@pytest.fixture
+def checkpoint_recording(monkeypatch):
+    """Record checkpoints, which entries of the leaderboard need."""
+    monkeypatch.setattr(CountingEnv, "records_checkpoints", True)
 
 
 @pytest.fixture
@@ -232,6 +238,7 @@ def test_episodes_with_errors_are_replayed_up_to_the_error(folder, tmp_path, cap
     assert "sample with seed" not in printed
 
 
+@pytest.mark.usefixtures("checkpoint_recording")
 def test_the_sample_of_an_entry_is_replayed(folder, card, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     entry, out = tmp_path / "entry", tmp_path / "entry" / "smoke"
@@ -249,9 +256,10 @@ def test_the_sample_of_an_entry_is_replayed(folder, card, tmp_path, monkeypatch,
     lines = (out / OUTCOMES).read_text().splitlines(keepends=True)
     (out / OUTCOMES).write_text("".join(lines[1:]))
     assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
-    assert "1 episode of its configurations missing" in capsys.readouterr().out
+    assert "1 episode of its tasks and splits missing" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("checkpoint_recording")
 def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     entry, out = tmp_path / "entries" / "mine" / "smoke", tmp_path / "page"
@@ -279,6 +287,7 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
     assert "mine/smoke" in (out / "index.html").read_text() and "mine/smoke" in (out / "results.md").read_text()
 
 
+@pytest.mark.usefixtures("checkpoint_recording")
 def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     record = json.loads((folder / RUN).read_text())
@@ -290,6 +299,7 @@ def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeyp
     assert not (tmp_path / "page").exists()
 
 
+@pytest.mark.usefixtures("checkpoint_recording")
 def test_a_result_whose_replay_crashes_is_skipped(folder, card, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     for name in ("mine", "other"):
@@ -308,6 +318,7 @@ def test_a_result_whose_replay_crashes_is_skipped(folder, card, tmp_path, monkey
     assert "could not be replayed" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("checkpoint_recording")
 def test_an_unreadable_result_does_not_hide_the_problems_of_others(folder, card, tmp_path, capsys):
     for name in ("first", "second"):
         leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / name / "smoke"))
@@ -319,6 +330,7 @@ def test_an_unreadable_result_does_not_hide_the_problems_of_others(folder, card,
     assert f"{first}: " in printed and f"{second}: episode 1" in printed and "2 with problems" in printed
 
 
+@pytest.mark.usefixtures("checkpoint_recording")
 def test_a_video_whose_outcome_differs_is_dropped(folder, card, tmp_path, monkeypatch):
     def record(result, protocol, policy, numbers, out):
         out.mkdir(parents=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from synthetic_results import of_protocol, outcome, write
+from synthetic_results import of_protocol, write
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
@@ -20,7 +21,17 @@ from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES
 from robocas_ms3.evaluation.results.result_files import OUTCOMES, read_result
 
+SPEC = {"track": "modular", "rate_hz": 20}
 ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
+
+
+def make_policy(name):
+    return {"name": name, "class": "mine:Policy", "spec": SPEC}
+
+
+def write_part(folder, result, outcomes):
+    """Write a result with the settings of another and some of its outcomes."""
+    return write(folder, outcomes, **result.run.to_dict())
 
 
 @pytest.fixture(scope="module")
@@ -49,24 +60,13 @@ def study(tmp_path_factory):
     ]
     lines = "".join(json.dumps(asdict(scene)) + "\n" for scene in scenes)
     (folder / "protocol" / DIFFICULTIES).write_text(lines)
-    template = of_protocol(folder / "template", protocol)
+    of_protocol(folder / "template", protocol)
     results = {}
     for name, ability in ABILITIES.items():
         removals = np.array([4 if scene.removals is None else scene.removals for scene in scenes])
         chance = 1 / (1 + np.exp(-3 * (ability - removals)))
-        outcomes = [
-            replace(
-                outcome(played.episode, 7 if rng.uniform() < p else 2),
-                task=played.task,
-                config=played.config,
-                seed=played.seed,
-            )
-            for played, p in zip(template.outcomes.values(), chance, strict=True)
-        ]
-        policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
-        results[name] = write(
-            folder / name, outcomes, protocol="clutter-v1", protocol_hash=protocol.hash, policy=policy
-        )
+        failed = [number for number, p in enumerate(chance) if rng.uniform() >= p]
+        results[name] = of_protocol(folder / name, protocol, failed, policy=make_policy(name))
     return folder, protocol, results
 
 
@@ -100,13 +100,34 @@ def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
     folder, _, results = study
     command = ["eval", "clutter-scale", *(str(folder / name) for name in results)]
     assert run([*command, "--protocol", str(folder / "protocol"), "--out", str(tmp_path)]) == 0
-    assert "strong" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "strong" in printed
+    assert "not audited" in printed
     written = json.loads((tmp_path / "curves.json").read_text())
     assert written["left_out"] == {}
     for task in ("pick", "search"):
         assert [policy["name"] for policy in written["tasks"][task]["policies"]] == ["strong", "middle", "weak"]
         assert len(written["tasks"][task]["difficulty"]) == len(written["tasks"][task]["episodes"]) == 80
     assert (tmp_path / "clutter_scale.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_command_identifies_the_scale_by_the_hashes_of_its_files(study, tmp_path, capsys):
+    """A scale that was fitted and then fixed has the same hash in both studies."""
+    folder, protocol, results = study
+    shutil.copytree(protocol.folder, tmp_path / "protocol")
+    command = ["eval", "clutter-scale", *(str(folder / name) for name in results)]
+    command += ["--protocol", str(tmp_path / "protocol"), "--out"]
+    assert run([*command, str(tmp_path / "fitted")]) == 0
+    shutil.copy(tmp_path / "fitted" / SCALE_FILE, tmp_path / "protocol")
+    assert capsys.readouterr().out.count("sha256") == 1
+    assert run([*command, str(tmp_path / "fixed")]) == 0
+    files = {name: (tmp_path / "protocol" / name).read_bytes() for name in (DIFFICULTIES, SCALE_FILE)}
+    hashes = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    output = capsys.readouterr().out
+    assert all(digest[:8] in output for digest in hashes.values())
+    for name, is_fixed in {"fitted": False, "fixed": True}.items():
+        written = json.loads((tmp_path / name / "curves.json").read_text())
+        assert (written["is_fixed"], written["sha256"]) == (is_fixed, hashes)
 
 
 def test_fixed_scale_of_the_protocol_places_one_policy(study, tmp_path):
@@ -145,10 +166,8 @@ def test_fixed_scale_without_the_task_of_a_result_is_an_error(study, tmp_path):
     both = make_study([results["middle"]], fixed)
     assert (list(both.tasks), list(both.left_out)) == (["pick"], ["search"])
     outcomes = [outcome for outcome in results["middle"].outcomes.values() if outcome.task == "search"]
-    policy = {"name": "middle", "class": "mine:Policy", "spec": {"track": "modular"}}
-    run = {"protocol": "clutter-v1", "protocol_hash": protocol.hash, "policy": policy}
-    with pytest.raises(EvaluationError):
-        make_study([write(tmp_path / "search", outcomes, **run)], fixed)
+    with pytest.raises(EvaluationError, match="no fixed scale"):
+        make_study([write_part(tmp_path / "search", results["middle"], outcomes)], fixed)
 
 
 @pytest.mark.parametrize(
@@ -193,10 +212,8 @@ def test_few_episodes_are_too_few(study):
     few = []
     for name in ("middle", "weak"):
         outcomes = [outcome for number, outcome in results[name].outcomes.items() if number < 15]
-        policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
-        run = {"protocol": "clutter-v1", "protocol_hash": protocol.hash, "policy": policy}
-        few.append(write(folder / f"few_{name}", outcomes, **run))
-    with pytest.raises(EvaluationError):
+        few.append(write_part(folder / f"few_{name}", results[name], outcomes))
+    with pytest.raises(EvaluationError, match="too few policies"):
         make_study(few, protocol)
 
 
@@ -205,9 +222,7 @@ def test_task_without_enough_policies_is_left_out(study):
     only_pick = []
     for name in ("middle", "weak"):
         outcomes = [outcome for outcome in results[name].outcomes.values() if outcome.task == "pick"]
-        policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
-        run = {"protocol": "clutter-v1", "protocol_hash": protocol.hash, "policy": policy}
-        only_pick.append(write(folder / f"pick_{name}", outcomes, **run))
+        only_pick.append(write_part(folder / f"pick_{name}", results[name], outcomes))
     found = make_study([*only_pick, results["strong"]], protocol)
     assert list(found.tasks) == ["pick"]
     assert len(found.left_out["search"]) == 1
@@ -215,17 +230,17 @@ def test_task_without_enough_policies_is_left_out(study):
 
 def test_result_of_another_protocol_is_refused(study):
     folder, protocol, results = study
-    policy = {"name": "other", "class": "mine:Policy", "spec": {"track": "modular"}}
     outcomes = list(results["weak"].outcomes.values())
-    other = write(folder / "other", outcomes, protocol="clutter-v1", protocol_hash="0" * 64, policy=policy)
-    with pytest.raises(EvaluationError):
+    run = results["weak"].run.to_dict() | {"policy": make_policy("other"), "protocol_hash": "0" * 64}
+    other = write(folder / "other", outcomes, **run)
+    with pytest.raises(EvaluationError, match="result of another protocol"):
         make_study([results["middle"], other], protocol)
 
 
 def test_two_results_of_the_same_policy_are_refused(study):
     folder, protocol, results = study
     shutil.copytree(results["weak"].folder, folder / "again")
-    with pytest.raises(EvaluationError):
+    with pytest.raises(EvaluationError, match="two results of the same policy"):
         make_study([*results.values(), read_result(folder / "again")], protocol)
 
 
@@ -248,5 +263,19 @@ def test_episodes_that_are_not_in_the_protocol_are_refused(study):
     path = copy / OUTCOMES
     line = json.loads(path.read_text().splitlines()[0]) | {"episode": len(protocol.episodes)}
     path.write_text(path.read_text() + json.dumps(line) + "\n")
-    with pytest.raises(EvaluationError):
+    with pytest.raises(EvaluationError, match="violation"):
         make_study([results["middle"], read_result(copy)], protocol)
+
+
+def test_results_with_violations_are_refused(study):
+    _, protocol, results = study
+    failed = next(one for one in results["weak"].outcomes.values() if not one.success)
+    outcomes = results["weak"].outcomes | {failed.episode: replace(failed, success=True)}
+    with pytest.raises(EvaluationError, match="violation"):
+        make_study([results["middle"], replace(results["weak"], outcomes=outcomes)], protocol)
+
+
+def test_results_without_stored_actions_are_placed(study, tmp_path):
+    _, protocol, results = study
+    without = [replace(result, folder=tmp_path / name, folders={}) for name, result in results.items()]
+    assert list(make_study(without, protocol).tasks) == ["pick", "search"]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from synthetic_results import of_protocol
@@ -11,8 +12,9 @@ from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.results.stored_episodes import find_checkpoints_file
 
-CONFIGS = {episode.config for episode in load_protocol("smoke").episodes}
+GROUPS = {(episode.task, episode.split) for episode in load_protocol("smoke").episodes}
 
 
 @pytest.fixture
@@ -25,7 +27,7 @@ def test_an_entry_has_all_outcomes_and_the_actions_of_the_sample(result, tmp_pat
     out = tmp_path / "entry" / "smoke"
     assert add(Add((result.folder,), out=out)) == 0
     assert "8 episodes, actions of 3" in capsys.readouterr().out
-    copy, sample = read_result(out), entries.choose_sample(load_protocol("smoke"), CONFIGS)
+    copy, sample = read_result(out), entries.choose_sample(load_protocol("smoke"), GROUPS)
     assert copy.outcomes == result.outcomes and copy.run == result.run and len(set(sample)) == 3
     assert sorted(path.stem for path in out.glob("actions/*")) == [f"{number:06d}" for number in sample]
     for number in sample:
@@ -80,16 +82,16 @@ def test_an_entry_has_no_links_and_the_name_of_its_protocol(result, tmp_path):
     assert any("model card" in text for text in entries.find_result_violations(read_result(out), protocol))
 
 
-def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch):
+def test_the_sample_depends_on_protocol_tasks_and_splits(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     protocol = load_protocol("smoke")
     picks = [episode.episode for episode in protocol.episodes if episode.task == "pick"]
-    assert entries.choose_sample(protocol, {protocol.episodes[picks[0]].config}) == picks
-    sample = entries.choose_sample(protocol, CONFIGS)
+    assert entries.choose_sample(protocol, {("pick", protocol.episodes[picks[0]].split)}) == picks
+    sample = entries.choose_sample(protocol, GROUPS)
     folder = tmp_path / "smoke"
     shutil.copytree(protocol.folder, folder)
     (folder / "protocol.yaml").open("a").write("# another protocol\n")
-    assert entries.choose_sample(load_protocol(folder), CONFIGS) != sample
+    assert entries.choose_sample(load_protocol(folder), GROUPS) != sample
 
 
 def test_bad_results_are_refused_and_nothing_is_written(result, tmp_path):
@@ -110,6 +112,39 @@ def test_bad_results_are_refused_and_nothing_is_written(result, tmp_path):
     with pytest.raises(EvaluationError, match="1 violation"):
         add(Add((result.folder,), out=other))
     assert not other.exists()
+
+
+def test_a_row_needs_all_its_configurations(tmp_path):
+    """Incident: a result with one of three configurations of pick, the easiest, was accepted and ranked."""
+    protocol, out = load_protocol("clutter-scale-v1"), tmp_path / "entry" / "clutter-scale-v1"
+    result = of_protocol(tmp_path / "result", protocol)
+    picks = {number: one for number, one in result.outcomes.items() if one.task == "pick"}
+    few = {number: one for number, one in picks.items() if one.config == "pick_few"}
+    assert entries.count_missing(replace(result, outcomes=few), protocol) == len(picks) - len(few) > 0
+    assert any("missing" in text for text in entries.find_result_violations(replace(result, outcomes=few), protocol))
+    with pytest.raises(EvaluationError, match="episodes missing"):
+        entries.write_result(replace(result, outcomes=few), protocol, out)
+    assert not out.exists()
+    sample = entries.write_result(replace(result, outcomes=picks), protocol, out)
+    assert len(sample) == entries.SAMPLE_SIZE and {protocol.episodes[number].task for number in sample} == {"pick"}
+
+
+def test_an_entry_needs_the_checkpoints_of_the_sample(result, tmp_path, monkeypatch):
+    monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
+    protocol, out, card = load_protocol("smoke"), tmp_path / "entry" / "smoke", tmp_path / "card.md"
+    card.write_text("# Model card: mine\n")
+    first, *_ = sample = entries.choose_sample(protocol, GROUPS)
+    for number in {*range(8)} - {*sample}:
+        find_checkpoints_file(result.folder, number).unlink()
+    assert add(Add((result.folder,), out=out, card=card)) == 0
+    assert entries.find_result_violations(read_result(out), protocol) == []
+    find_checkpoints_file(out, first).unlink()
+    assert entries.find_result_violations(read_result(out), protocol) == [f"episode {first}: no checkpoints"]
+    find_checkpoints_file(result.folder, first).unlink()
+    with pytest.raises(EvaluationError, match="checkpoints"):
+        add(Add((result.folder,), out=tmp_path / "other" / "smoke", card=card))
+    run = result.run.model_copy(update={"backend": "gpu"})
+    assert entries.list_missing_checkpoints(replace(result, run=run), protocol) == []
 
 
 def test_other_folders_keep_their_readme(result, tmp_path):

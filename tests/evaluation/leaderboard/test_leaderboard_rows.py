@@ -9,6 +9,7 @@ from robocas_ms3.evaluation.leaderboard.rows import (
     Leaderboard,
     LeaderboardRow,
     Training,
+    find_seen_row,
     read_leaderboard,
     read_published_rows,
     replace_rows,
@@ -56,6 +57,16 @@ def test_new_rows_replace_those_with_the_same_conditions():
     kept = [make_row(task="search"), make_row(policy="other"), make_row(differences=["weld"]), trained]
     new = make_row(successes=2, rate=0.5, weights="ab")
     assert replace_rows([published, make_row(), *kept], [new]) == [new, *kept]
+
+
+def test_the_seen_row_is_of_the_same_entry():
+    """Incident: two policy servers with one address shared the row of the split seen."""
+    first, second = (
+        [make_row(policy="ws://localhost:8000", entry=entry, split=split) for split in ("seen", "new")]
+        for entry in ("first", "second")
+    )
+    assert find_seen_row(second[1], [*first, *second]) is second[0]
+    assert find_seen_row(second[1], first) is None
 
 
 def test_a_row_with_fewer_episodes_replaces_none():

@@ -9,6 +9,7 @@ import pytest
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.json_lines import JsonLinesFile
+from robocas_ms3.demos.difficulty import difficulty_file
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.evaluation.clutter_scale.features import make_features
 from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales
@@ -18,7 +19,7 @@ from robocas_ms3.evaluation.protocols.scene_difficulties import DIFFICULTIES, me
 GEOMETRY = ("seed", "target", "objects", "visible_fraction", "obstacles", "free_grasps", "fewest_blockers", "gap")
 
 
-def test_scenes_are_measured_in_the_frozen_layouts(tmp_path):
+def test_scenes_are_measured_in_the_frozen_layouts(tmp_path, monkeypatch):
     protocol = load_protocol("clutter-scale-v1")
     expected = read_difficulties_of(protocol)
     numbers = [1, 0, next(n for n, episode in enumerate(protocol.episodes) if episode.task == "search")]
@@ -36,6 +37,9 @@ def test_scenes_are_measured_in_the_frozen_layouts(tmp_path):
     more = replace(protocol, episodes=(*few.episodes, protocol.episodes[2]))
     next(iter(measure_protocol(more, tmp_path, limits)))
     assert not (tmp_path / DIFFICULTIES).exists(), "not all scenes are measured"
+    monkeypatch.setattr(difficulty_file, "hash_source", lambda: "0" * 64)  # of a changed skill
+    with pytest.raises(OutputExistsError):
+        list(measure_protocol(few, tmp_path, limits))
 
 
 def test_a_file_of_another_command_is_not_replaced(tmp_path):

@@ -16,6 +16,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocols.protocol import load_protocol
 from robocas_ms3.evaluation.results import verify as verify_module
 from robocas_ms3.evaluation.results.result_files import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.results.stored_episodes import hash_actions, write_actions
 from robocas_ms3.evaluation.results.verify import find_violations
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -74,11 +75,41 @@ def test_flags_in_an_impossible_order_are_found(folder, protocol, changes, viola
     assert f"episode 0: flags: {violation}" in find_violations(read_result(folder), protocol)
 
 
-def test_stages_of_goals_without_a_basket_and_of_custom_tasks_may_differ(folder, protocol, monkeypatch):
-    before = read_result(folder).outcomes[0]
-    flags = {name: step for name, step in before.flags.items() if name != "target_in_basket"} | {"target_lifted": None}
-    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags))  # a pushed target
+@pytest.mark.parametrize("name", ["target_in_basket", "success_v0"])
+def test_flags_of_the_basket_must_exist(folder, protocol, name):
+    """Incident: without the flag target_in_basket, an outcome could skip the stages before success."""
+    flags = {flag: step for flag, step in read_result(folder).outcomes[0].flags.items() if flag != name}
+    flags |= {"target_lifted": None}
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags), success_v0=False)
+    found = find_violations(read_result(folder), protocol)
+    assert f"episode 0: flags: missing {name}" in found
+    assert any("expected target_lifted at the same step or before" in text for text in found)
+
+
+def test_an_episode_without_an_error_has_a_step(folder, protocol):
+    """Incident: a result whose episodes all succeed after 0 steps had no violations."""
+    flags = {name: None if step is None else 0 for name, step in read_result(folder).outcomes[0].flags.items()}
+    actions = np.zeros((0, 7), np.float32)
+    write_actions(folder, 0, actions)
+    (folder / "checkpoints" / "000000.npz").unlink()
+    values = {"steps": 0, "seconds": 0.0, "flags": flags, "flag_seconds": seconds_of(flags)}
+    tamper(folder, 0, **values, actions_hash=hash_actions(actions))
+    assert find_violations(read_result(folder), protocol) == [
+        "episode 0: 0 steps, expected at least 1 without an error"
+    ]
+    failed = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "error"}
+    tamper(folder, 0, **failed, error="the worker process crashed")
     assert find_violations(read_result(folder), protocol) == []
+
+
+def test_search_needs_a_retrieval_order(folder, protocol):
+    number = next(one.episode for one in protocol.episodes if one.task == "search")
+    tamper(folder, number, retrieval=None)
+    (violation,) = find_violations(read_result(folder), protocol)
+    assert violation.startswith(f"episode {number}: retrieval: ")
+
+
+def test_flags_of_custom_tasks_may_differ(folder, protocol, monkeypatch):
     flags = {"success": 70, "fail": None, "success_v0": 70}
     tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags))
     assert "flags: missing reached_any" in find_violations(read_result(folder), protocol)[0]
@@ -92,7 +123,6 @@ def test_stages_of_goals_without_a_basket_and_of_custom_tasks_may_differ(folder,
 
 def test_damaged_checkpoints_are_found(folder, protocol):
     path = folder / "checkpoints" / "000003.npz"
-    path.parent.mkdir()
     path.write_bytes(b"PK")
     (violation,) = find_violations(read_result(folder), protocol)
     assert violation.startswith("episode 3: ") and "000003.npz" in violation
@@ -146,7 +176,8 @@ def tamper_run(folder, **values):
         ({"seconds": 3.0}, "episode 0: seconds is 3, expected 3.5 for 70 steps at 20 Hz"),
         (
             {"flags": {"success": 70}},
-            "episode 0: flags: missing reached_any, picked_any, reached_target, target_grasped, target_lifted, fail",
+            "episode 0: flags: missing reached_any, picked_any, reached_target, target_grasped, target_lifted, "
+            "target_in_basket, fail, success_v0",
         ),
         (
             {"measures": {"path_length": 1.0, "fallen": 0.0}},
