@@ -423,6 +423,11 @@ def test_episodes_of_another_processor_are_replayed_from_checkpoint_to_checkpoin
         write_checkpoints(out, number, checkpoints)
         mode, differences = audit_again(number)
         assert (mode, bool(differences)) == ("checkpoints", expected), differences
+    checkpoints = true.read_checkpoints(number)
+    checkpoints.states[3, : 13 * 11 : 13] += 0.14  # x of eleven bodies, m
+    write_checkpoints(out, number, checkpoints)
+    mode, differences = audit_again(number)
+    assert mode == "checkpoints" and "moved 1." in " ".join(differences)
     write_checkpoints(out, number, true.read_checkpoints(number))
     one = true.outcomes[number]
     for factor, expected in ((1.01, False), (1.2, True)):

@@ -11,7 +11,7 @@ from robocas_ms3.evaluation.audit.stored_actions import CheckpointEnv, Checkpoin
 from robocas_ms3.evaluation.results.checkpoints import StateDeviation, flatten_state, unflatten_state
 from robocas_ms3.evaluation.results.outcomes import Checkpoints
 
-FAR = StateDeviation(0.1, 0.1, 0.1)
+FAR = StateDeviation(0.1, 0.1, 0.1, 0.1)
 
 
 class FakeEnv:
