@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.cli.options import Maybe, resumable
+from robocas_ms3.cli.options import CORES, Jobs, Maybe, resumable
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from robocas_ms3.evaluation.audit.run import AuditedEpisode, AuditPlan, AuditSummary
+    from robocas_ms3.evaluation.audit.replay import AuditedEpisode
+    from robocas_ms3.evaluation.audit.run import AuditPlan, AuditSummary
     from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results.result_files import Result
 
@@ -28,14 +28,14 @@ class ReplayOptions:
     """Replay N episodes per result, chosen at random. Default: all with stored actions."""
     seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Random seed of --sample. Default: a random number, which is printed."""
-    envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Number of environments that run at the same time. Default: one per CPU core."""
+    jobs: Jobs = CORES
+    """Number of processes; 0: replay in this process, without limits of time and memory."""
 
     def check(self) -> None:
         """Raise an error if a number is too small."""
         from robocas_ms3.core.checks import check_number
 
-        for name, least in (("sample", 1), ("envs", 1), ("seed", 0)):
+        for name, least in (("sample", 1), ("jobs", 0), ("seed", 0)):
             if (number := getattr(self, name)) is not None:
                 check_number(f"--{name}", number, least)
 
@@ -65,7 +65,7 @@ class Audit(ReplayOptions):
 def audit(cfg: Audit) -> int:
     from robocas_ms3.cli.eval_results import print_violations
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.audit.run import find_audit_obstacle
+    from robocas_ms3.evaluation.audit.obstacles import find_audit_obstacle
     from robocas_ms3.evaluation.results.result_files import load_protocol_of, read_result
     from robocas_ms3.evaluation.results.verify import find_violations
 
@@ -99,7 +99,8 @@ def replay_result(
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.source_hash import hash_source
-    from robocas_ms3.evaluation.audit.run import AuditSummary, list_other_processors, run_audit
+    from robocas_ms3.evaluation.audit.obstacles import list_other_processors
+    from robocas_ms3.evaluation.audit.run import AuditSettings, AuditSummary, run_audit
 
     if models := list_other_processors(result):
         print_line(f"note: made on another model of processor, so contacts may diverge: {', '.join(models)}")
@@ -113,17 +114,8 @@ def replay_result(
             plans.append(plan)
             bar.start(len(plan.episodes))
 
-        for one in run_audit(
-            result,
-            protocol,
-            out,
-            sample=options.sample,
-            seed=options.seed,
-            stored=stored,
-            envs=options.envs or len(os.sched_getaffinity(0)),
-            overwrite=overwrite,
-            on_start=start,
-        ):
+        settings = AuditSettings(options.sample, options.seed, stored, options.jobs, overwrite)
+        for one in run_audit(result, protocol, out, settings, start):
             bar.advance()
             episodes.append(one)
     summary = AuditSummary(plans[0], episodes)
@@ -134,7 +126,7 @@ def replay_result(
 
 def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summary: AuditSummary) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.audit.run import bound_differing_episodes
+    from robocas_ms3.evaluation.audit.sample import bound_differing_episodes
 
     plan, total = summary.plan, len(result.outcomes)
     count = len(plan.episodes)

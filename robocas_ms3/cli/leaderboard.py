@@ -151,7 +151,8 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
     """
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import RobocasError
-    from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit
+    from robocas_ms3.evaluation.audit.obstacles import find_audit_obstacle
+    from robocas_ms3.evaluation.audit.run import hash_audit
     from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
     from robocas_ms3.evaluation.results.result_files import load_protocol_of, read_result

@@ -67,7 +67,8 @@ class SimulationOptions:
     envs: int = 2
     """Number of environments that run at the same time; outcomes do not depend on it."""
     workers: Annotated[int | None, _NO_HINT] = None
-    """Number of worker processes. Default: one per environment, at most one per CPU core."""
+    """Number of worker processes. Default: one per environment, at most one per CPU core.
+    0: all environments in this process, without limits."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
     step_seconds: float = 300.0
@@ -86,9 +87,9 @@ class EvaluationSettings(EvaluationOptions, SelectionOptions, SimulationOptions)
     """
 
     def __post_init__(self) -> None:
-        for name in ("envs", "episodes", "workers"):
+        for name, least in (("envs", 1), ("episodes", 1), ("workers", 0)):
             if (number := getattr(self, name)) is not None:
-                check_number(f"--{name}", number, 1)
+                check_number(f"--{name}", number, least)
         for number in self.action_noise:
             check_number("--action-noise", number, 0)
         check_number("--step-seconds", self.step_seconds, 1)

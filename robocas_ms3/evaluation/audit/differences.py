@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.output_folder import list_setting_changes
-from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
-from robocas_ms3.evaluation.results.checkpoints import StateDeviation
+from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT, RESTORE_TOLERANCE
+from robocas_ms3.evaluation.results.checkpoints import SMALL_DEVIATION, StateDeviation
 from robocas_ms3.evaluation.results.outcomes import Checkpoints, Outcome
 
 # Tolerances of a replay from checkpoint to checkpoint; docs/evaluation.md has measurements.
-LARGEST_DEVIATION = StateDeviation(target=0.15, body=0.5, joint=0.1)
-"""Largest deviations from a checkpoint. Other objects than the target may roll away."""
-SMALL_DEVIATION = 0.01
-"""Largest distance of the target from its recorded position at most checkpoints, m."""
+LARGEST_DEVIATION = StateDeviation(target=0.15, body=0.5, joint=0.1, moved=0.5)
+"""Largest deviations from a checkpoint; that of ``moved`` is also the limit of its sum over an episode."""
+LARGEST_JOINT_SUM = 0.5
+"""Largest sum of the deviations of joints over an episode, without those up to `RESTORE_TOLERANCE`, rad or m."""
 LARGEST_FRACTION = 0.3
-"""Largest fraction of checkpoints with a larger distance than `SMALL_DEVIATION`; one is always allowed."""
+"""Largest fraction of checkpoints at which the target is farther than `SMALL_DEVIATION`; one is always allowed."""
 LARGEST_DELAY = 2.0
 """Largest difference of simulated times in s. Numbers of steps may differ by the steps between two checkpoints."""
 _RELATIVE = {"path_length": 0.02, "contact_impulse": 0.25}  # of measures
@@ -86,7 +86,14 @@ def list_deviations(recorded: Checkpoints, deviations: Sequence[StateDeviation],
     if far.any():
         first = int(np.argmax(far))
         found = ", ".join(f"{name} {value:.3f}" for name, value in deviations[first]._asdict().items())
-        return [f"checkpoints: after step {steps[first]} the deviations are (m, m, rad or m) {found}"]
+        return [f"checkpoints: after step {steps[first]} the deviations are (joint in rad or m, others in m) {found}"]
+    joints, moved = values[:, 2], values[:, 3].sum()
+    if moved > LARGEST_DEVIATION.moved:
+        expected = f"expected at most {LARGEST_DEVIATION.moved:g} m"
+        return [f"checkpoints: other objects than the target deviate by {moved:.2f} m in all, {expected}"]
+    if (turned := joints[joints > RESTORE_TOLERANCE].sum()) > LARGEST_JOINT_SUM:
+        expected = f"expected at most {LARGEST_JOINT_SUM:g}"
+        return [f"checkpoints: the joints deviate by {turned:.2f} rad or m in all, {expected}"]
     count, allowed = int((values[:, 0] > SMALL_DEVIATION).sum()), max(1, int(LARGEST_FRACTION * len(values)))
     if count > allowed:
         expected = f"expected at most {allowed}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -66,13 +67,9 @@ class StoredActionsPolicy:
         return found
 
 
-class CheckpointEnv:
-    """Vector environment whose envs return to a recorded state if they are far from it, at each checkpoint.
-
-    Args:
-        env: vector environment of `PolicyActionWrapper` envs in processes.
-        policy: policy that chooses the actions.
-        result: the result, with checkpoints.
+@dataclass(frozen=True)
+class CheckpointLog:
+    """Comparison of replays with the recorded checkpoints.
 
     Attributes:
         deviations: by number of the episode, how far the state was from each checkpoint.
@@ -81,10 +78,23 @@ class CheckpointEnv:
             not.
     """
 
-    def __init__(self, env: Any, policy: StoredActionsPolicy, result: Result) -> None:
+    deviations: dict[int, list[StateDeviation]] = field(default_factory=dict)
+    lost_stages: dict[int, dict[str, tuple[int, int] | None]] = field(default_factory=dict)
+
+
+class CheckpointEnv:
+    """Vector environment whose envs return to a recorded state if they are far from it, at each checkpoint.
+
+    Args:
+        env: vector environment of `PolicyActionWrapper` envs in processes.
+        policy: policy that chooses the actions.
+        result: the result, with checkpoints.
+        log: gets how far each state was from its checkpoint.
+    """
+
+    def __init__(self, env: Any, policy: StoredActionsPolicy, result: Result, log: CheckpointLog) -> None:
         self._env, self._policy, self._result, self.num_envs = env, policy, result, env.num_envs
-        self.deviations: dict[int, list[StateDeviation]] = {}
-        self.lost_stages: dict[int, dict[str, tuple[int, int] | None]] = {}
+        self._log = log
         self._checkpoints: dict[int, Checkpoints] = {}  # by episode
 
     def reset(self, **kwargs: Any) -> Any:
@@ -93,7 +103,7 @@ class CheckpointEnv:
     def step(self, actions: Any) -> Any:
         results, calls = self._env.step(actions), {}
         for env, (episode, step) in self._policy.progress.items():
-            for stage, reached_again in (lost := self.lost_stages.setdefault(episode, {})).items():
+            for stage, reached_again in (lost := self._log.lost_stages.setdefault(episode, {})).items():
                 if reached_again is None and results[-1][stage][env]:
                     lost[stage] = step, int(results[-1]["elapsed_steps"][env])
             if episode not in self._checkpoints:
@@ -105,8 +115,8 @@ class CheckpointEnv:
         if calls:
             for env, (deviation, stages) in self._env.call_each("restore_checkpoint", calls).items():
                 episode = self._policy.progress[env][0]
-                self.deviations.setdefault(episode, []).append(deviation)
-                self.lost_stages[episode].update(dict.fromkeys(stages))
+                self._log.deviations.setdefault(episode, []).append(deviation)
+                self._log.lost_stages[episode].update(dict.fromkeys(stages))
         return results
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from scipy.stats import fisher_exact
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.core.text import escape_controls
-from robocas_ms3.evaluation.audit.run import Mode
+from robocas_ms3.evaluation.audit.replay import Mode
 from robocas_ms3.evaluation.leaderboard.entries import get_entry_name, list_stored_episodes
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.page import render_leaderboard_page

@@ -10,6 +10,8 @@ import torch
 
 from robocas_ms3.tasks.bodies import BODY
 
+SMALL_DEVIATION = 0.01
+"""Distance of a body from its recorded position that counts as small, m."""
 _POSE = 7  # numbers of a pose at the start of the state of a body
 
 
@@ -20,11 +22,13 @@ class StateDeviation(NamedTuple):
         target: distance of the target or the basket from its position in the checkpoint, the larger one, m.
         body: the same for the movable actor that is farthest from its position, m.
         joint: largest difference of a joint position, rad or m.
+        moved: sum of the distances of the other movable actors, without those up to `SMALL_DEVIATION`, m.
     """
 
     target: float
     body: float
     joint: float
+    moved: float
 
 
 def flatten_state(state: Mapping[str, Any]) -> torch.Tensor:
@@ -71,6 +75,9 @@ def restore_checkpoint(base: Any, checkpoint: np.ndarray, tolerance: float) -> t
         target=float(np.max([distances[name] for name in placed])),
         body=float(np.max(list(distances.values()))),
         joint=float(joints.abs().max()),
+        moved=float(
+            np.sum([far for name, far in distances.items() if name not in placed and not far <= SMALL_DEVIATION])
+        ),
     )
     if all(value <= tolerance for value in deviation):
         return deviation, []

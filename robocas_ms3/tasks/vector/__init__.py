@@ -48,7 +48,8 @@ def make_vec(
         env_id: gymnasium id, such as ``RoboCASPick-v1``; ``module:Id-v1`` imports the module first.
         num_envs: N.
         backend: ``processes`` (on the CPU), ``gpu`` (one batch), or ``auto``: a GPU if there is one.
-        workers: number of processes; default: one per env, at most one per core.
+        workers: number of processes; default: one per env, at most one per core. 0: no processes, the envs run in this
+            process, one after the other and without limits.
         arrays: type of the results, ``torch`` or ``numpy``.
         wrappers: functions that wrap each env, or the batch on a GPU; the first function makes the innermost wrapper.
         limits: time and memory limits of a process per step or reset; a process that exceeds them is killed.
@@ -60,9 +61,10 @@ def make_vec(
         VectorEnvCrashError: a worker process crashed.
         Exception: any error that ``gym.make`` raises.
     """
-    for name, value in (("num_envs", num_envs), ("workers", 1 if workers is None else workers)):
-        if not isinstance(value, int) or value < 1:
-            raise VectorEnvError("invalid number", where=name, expected="an integer of at least 1", found=repr(value))
+    for name, value, least in (("num_envs", num_envs, 1), ("workers", 1 if workers is None else workers, 0)):
+        if not isinstance(value, int) or value < least:
+            expected = f"an integer of at least {least}"
+            raise VectorEnvError("invalid number", where=name, expected=expected, found=repr(value))
     if arrays not in ("torch", "numpy"):
         raise VectorEnvError("invalid value", where="arrays", expected='"torch" or "numpy"', found=repr(arrays))
     _check_id(env_id)
@@ -72,7 +74,7 @@ def make_vec(
         for wrap in wrappers:
             env = wrap(env)
     else:
-        workers = min(num_envs, workers or len(os.sched_getaffinity(0)))
+        workers = min(num_envs, len(os.sched_getaffinity(0)) if workers is None else workers)
         env = ProcessEnv(env_id, num_envs, workers, kwargs, wrappers, limits)
     return RoboCASVectorEnv(env, arrays, **options)
 

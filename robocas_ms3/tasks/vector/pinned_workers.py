@@ -1,4 +1,4 @@
-"""Worker processes that run in parallel, each with its own worker object."""
+"""Worker objects that run in parallel, each in its own process, or one after the other in this process."""
 
 from __future__ import annotations
 
@@ -119,6 +119,28 @@ class PinnedWorkers(Generic[Task, Result]):
         if errors:
             raise errors[min(errors)]
         return answers
+
+
+class InProcessWorkers(Generic[Task, Result]):
+    """Worker objects of this process, with the interface of `PinnedWorkers`; they run one after the other.
+
+    Args:
+        make_workers: functions that make the worker objects.
+    """
+
+    pids = ()
+    busy = False
+
+    def __init__(self, make_workers: Sequence[Callable[[], Worker[Task, Result]]]) -> None:
+        self._workers, self.closed = [make() for make in make_workers], False
+
+    def run(self, tasks: Sequence[Task]) -> list[Result]:
+        """Run one task in each worker, and return the results in the order of the workers."""
+        return [worker.run(task) for worker, task in zip(self._workers, tasks, strict=True)]
+
+    def close(self) -> None:
+        """Drop the workers."""
+        self._workers, self.closed = [], True
 
 
 def _launch_processes(processes: list[WorkerProcess[Any, Any]], launched: Future[None], ended: threading.Event) -> None:

@@ -20,8 +20,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from robocas_ms3.core.errors import VectorEnvCrashError, VectorEnvError
 from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessCrashError
 from robocas_ms3.tasks.seeds import consecutive_seeds
-from robocas_ms3.tasks.vector.pinned_workers import PinnedWorkers
-from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, split_rows
+from robocas_ms3.tasks.vector.pinned_workers import InProcessWorkers, PinnedWorkers
+from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_rows, make_process_worker, split_rows
 
 
 class ProcessEnv(gym.Env):
@@ -34,7 +34,7 @@ class ProcessEnv(gym.Env):
     Args:
         env_id: gymnasium id of a ManiSkill environment.
         num_envs: number of envs, N.
-        workers: number of processes; each has equally many envs, or one more.
+        workers: number of processes; each has equally many envs, or one more; 0: all envs are in this process.
         kwargs: arguments of ``gym.make``; sent with cloudpickle.
         wrappers: functions that wrap each env; the first function makes the innermost wrapper. Sent with cloudpickle.
         limits: time and memory limits of a process per step or reset; a process that exceeds them is killed.
@@ -76,7 +76,8 @@ class ProcessEnv(gym.Env):
             fix = f'Register the environment in a module, and pass the id "my_module:{self.spec.id}".'
             what = "worker processes can't import an environment that is registered in the main program"
             raise VectorEnvError(what, where=env_id, fix=fix)
-        cuts = [num_envs * worker // workers for worker in range(workers + 1)]
+        parts = max(workers, 1)
+        cuts = [num_envs * part // parts for part in range(parts + 1)]
         self._env_ranges = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
         with tempfile.NamedTemporaryFile(prefix="robocas-envs-") as busy_file:
             self._busy = np.memmap(busy_file, mode="w+", shape=num_envs)
@@ -87,9 +88,9 @@ class ProcessEnv(gym.Env):
                 raise VectorEnvError(
                     "the arguments can't be sent to worker processes", where=env_id, found=error
                 ) from error
-            self._workers = PinnedWorkers(
-                [partial(EnvWorker, pickled, env_range) for env_range in self._env_ranges], limits
-            )
+            make = make_process_worker if workers else EnvWorker
+            make_workers = [partial(make, pickled, env_range) for env_range in self._env_ranges]
+            self._workers = PinnedWorkers(make_workers, limits) if workers else InProcessWorkers(make_workers)
             for name in ("render_mode", "metadata", "single_observation_space", "single_action_space"):
                 setattr(self, name, self.call(name)[0])
         self.pids = self._workers.pids

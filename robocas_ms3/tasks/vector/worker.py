@@ -51,9 +51,6 @@ class EnvWorker:
     """
 
     def __init__(self, settings: bytes, envs: range) -> None:
-        faulthandler.enable()
-        os.environ.setdefault("LP_NUM_THREADS", "1")  # several processes render in software
-        use_one_torch_thread()
         self._settings: EnvSettings = pickle.loads(settings)
         self._busy = np.memmap(self._settings.busy_file, mode="r+")
         self._first, self._envs = envs.start, dict[int, gym.Env]()
@@ -148,6 +145,14 @@ class EnvWorker:
             _log.warning("env %d: no layout for seed %d; drawing another seed: %s", env, seed, error)
             obs, info = self._envs[env].reset(options=options)
         return flatten_to_rows({"obs": obs, "info": info})
+
+
+def make_process_worker(settings: bytes, envs: range) -> EnvWorker:
+    """Return the worker of a process of its own, whose global settings this function changes."""
+    faulthandler.enable()
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # several processes render in software
+    use_one_torch_thread()
+    return EnvWorker(settings, envs)
 
 
 def flatten_to_rows(nested: dict[str, Any], path: tuple[str, ...] = ()) -> Rows:

@@ -13,13 +13,9 @@ from robocas_ms3.cli import leaderboard
 from robocas_ms3.cli.eval_audit import Audit, audit
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
-from robocas_ms3.evaluation.audit.run import (
-    bound_differing_episodes,
-    choose_episodes,
-    find_audit_obstacle,
-    list_other_processors,
-    run_audit,
-)
+from robocas_ms3.evaluation.audit.obstacles import find_audit_obstacle, list_other_processors
+from robocas_ms3.evaluation.audit.run import AuditSettings, run_audit
+from robocas_ms3.evaluation.audit.sample import bound_differing_episodes, choose_episodes
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -77,9 +73,10 @@ def card(tmp_path):
     return path
 
 
-def replay(folder, out="audit", **settings):
+def replay(folder, out="audit", on_start=lambda plan: None, **settings):
     """Return the numbers of the replayed episodes and of those that differ."""
-    audited = list(run_audit(read_result(folder), SMOKE, folder.parent / out, envs=1, **settings))
+    settings = AuditSettings(jobs=0, **settings)
+    audited = list(run_audit(read_result(folder), SMOKE, folder.parent / out, settings, on_start))
     return [one.episode for one in audited], [one.episode for one in audited if one.differences]
 
 
@@ -232,7 +229,7 @@ def test_episodes_with_errors_are_replayed_up_to_the_error(folder, tmp_path, cap
     none = {"flags": dict.fromkeys(flags), "flag_seconds": dict.fromkeys(flags), "steps": 0, "seconds": 0.0}
     forge(folder, 0, np.zeros((0, 7)), **lost, error="the worker process crashed", **none)
     assert choose_episodes(read_result(folder), None, 0) == [1, 2, 3]
-    assert audit(Audit(folder, out=tmp_path / "complete", envs=1)) == 0
+    assert audit(Audit(folder, out=tmp_path / "complete", jobs=0)) == 0
     printed = capsys.readouterr().out
     assert "1 episode failed before the first action" in printed
     assert "sample with seed" not in printed
@@ -243,19 +240,19 @@ def test_the_sample_of_an_entry_is_replayed(folder, card, tmp_path, monkeypatch,
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     entry, out = tmp_path / "entry", tmp_path / "entry" / "smoke"
     assert leaderboard.add(leaderboard.Add((folder,), card=card, out=out)) == 0
-    assert leaderboard.audit(leaderboard.AuditEntries((entry,), envs=1)) == 0
+    assert leaderboard.audit(leaderboard.AuditEntries((entry,), jobs=0)) == 0
     sample = entries.list_stored_episodes(read_result(out), SMOKE)
     (other,) = {0, 1, 2, 3} - set(sample)
     path = read_result(out).outcomes[sample[0]].measures | {"path_length": 7.0}
     forge(out, sample[0], measures=path)
-    assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
+    assert leaderboard.audit(leaderboard.AuditEntries((out,), jobs=0)) == 1
     assert f"episode {sample[0]}, recorded -> replayed: measures.path_length" in capsys.readouterr().out
     forge(out, other, actions_hash="")
-    assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
+    assert leaderboard.audit(leaderboard.AuditEntries((out,), jobs=0)) == 1
     assert f"episode {other}: actions_hash is empty" in capsys.readouterr().out
     lines = (out / OUTCOMES).read_text().splitlines(keepends=True)
     (out / OUTCOMES).write_text("".join(lines[1:]))
-    assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
+    assert leaderboard.audit(leaderboard.AuditEntries((out,), jobs=0)) == 1
     assert "1 episode of its tasks and splits missing" in capsys.readouterr().out
 
 
@@ -264,7 +261,7 @@ def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkey
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     entry, out = tmp_path / "entries" / "mine" / "smoke", tmp_path / "page"
     assert leaderboard.add(leaderboard.Add((folder,), card=card, out=entry)) == 0
-    build = leaderboard.Build(tmp_path / "entries", out, envs=1)
+    build = leaderboard.Build(tmp_path / "entries", out, jobs=0)
     assert leaderboard.build(build) == 0
     rows = [row for row in read_leaderboard(out / "results.json").rows if not row.published]
     assert {(row.task, row.n, row.audited) for row in rows} == {("pick", 2, 2), ("select", 2, 2)}
@@ -295,7 +292,7 @@ def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeyp
     for name in ("mine", "again"):
         leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / name / "smoke"))
     with pytest.raises(EvaluationError, match="two results of the same policy"):
-        leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", envs=1))
+        leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", jobs=0))
     assert not (tmp_path / "page").exists()
 
 
@@ -312,7 +309,7 @@ def test_a_result_whose_replay_crashes_is_skipped(folder, card, tmp_path, monkey
         return replay_result(result, *args, **kwargs)
 
     monkeypatch.setattr(leaderboard, "replay_result", crash)
-    build = leaderboard.Build(tmp_path / "entries", tmp_path / "page", skip_errors=True, envs=1)
+    build = leaderboard.Build(tmp_path / "entries", tmp_path / "page", skip_errors=True, jobs=0)
     assert leaderboard.build(build) == 0
     assert "mine/smoke" in (tmp_path / "page" / "results.md").read_text()
     assert "could not be replayed" in capsys.readouterr().out
@@ -325,7 +322,7 @@ def test_an_unreadable_result_does_not_hide_the_problems_of_others(folder, card,
     first, second = (tmp_path / "entries" / name / "smoke" for name in ("first", "second"))
     (first / RUN).write_text("{")
     forge(second, 1, success_at_end=False)
-    assert leaderboard.audit(leaderboard.AuditEntries((tmp_path / "entries",), envs=1)) == 1
+    assert leaderboard.audit(leaderboard.AuditEntries((tmp_path / "entries",), jobs=0)) == 1
     printed = capsys.readouterr().out
     assert f"{first}: " in printed and f"{second}: episode 1" in printed and "2 with problems" in printed
 
@@ -343,7 +340,7 @@ def test_a_video_whose_outcome_differs_is_dropped(folder, card, tmp_path, monkey
     monkeypatch.setattr(videos, "choose_episodes", lambda result, count: [0, 1])
     monkeypatch.setattr(videos, "record_videos", record)
     leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / "mine" / "smoke"))
-    assert leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", videos=2, envs=1)) == 0
+    assert leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", videos=2, jobs=0)) == 0
     page = (tmp_path / "page" / "index.html").read_text()
     assert "episode_00001.mp4" in page
     assert "episode_00000.mp4" not in page
@@ -427,7 +424,7 @@ def test_episodes_of_another_processor_are_replayed_from_checkpoint_to_checkpoin
     protocol, true = load_protocol(str(short)), read_result(picked)
 
     def audit_again(number):
-        audited = run_audit(read_result(out), protocol, tmp_path / "audit", sample=2, seed=3, overwrite=True)
+        audited = run_audit(read_result(out), protocol, tmp_path / "audit", AuditSettings(2, 3, jobs=0, overwrite=True))
         return next((one.mode, one.differences) for one in audited if one.episode == number)
 
     number = choose_episodes(true, 2, 3)[0]
@@ -438,6 +435,11 @@ def test_episodes_of_another_processor_are_replayed_from_checkpoint_to_checkpoin
         write_checkpoints(out, number, checkpoints)
         mode, differences = audit_again(number)
         assert (mode, bool(differences)) == ("checkpoints", expected), differences
+    checkpoints = true.read_checkpoints(number)
+    checkpoints.states[3, : 13 * 11 : 13] += 0.14  # x of eleven bodies, m
+    write_checkpoints(out, number, checkpoints)
+    mode, differences = audit_again(number)
+    assert mode == "checkpoints" and "moved 1." in " ".join(differences)
     write_checkpoints(out, number, true.read_checkpoints(number))
     one = true.outcomes[number]
     for factor, expected in ((1.01, False), (1.2, True)):
@@ -470,6 +472,6 @@ def test_a_stage_that_a_checkpoint_lacks_counts_from_when_it_is_reached_again(tm
         checkpoints.states[row, 13] += 0.02  # x of the second body, m
         write_checkpoints(out, number, checkpoints)
         audit = tmp_path / f"audit_{row}"
-        (one,) = run_audit(read_result(out), protocol, audit, stored={number}, envs=1)
+        (one,) = run_audit(read_result(out), protocol, audit, AuditSettings(stored_episodes={number}, jobs=0))
         assert one.mode == "checkpoints"
         assert any("flags.target_lifted" in text for text in one.differences) == is_late, one.differences

@@ -125,17 +125,30 @@ def test_recorded_states_are_compared():
     ],
 )
 def test_deviations_of_the_target_are_limited(targets, is_far):
-    deviations = [StateDeviation(one, one, 0.0) for one in targets]
+    deviations = [StateDeviation(one, one, 0.0, 0.0) for one in targets]
     assert bool(list_deviations(make_checkpoints(len(targets)), deviations, 20)) == is_far
 
 
 @pytest.mark.parametrize(
     ("deviation", "is_far"),
-    [((0.0, 0.4, 0.0), False), ((0.0, 0.6, 0.0), True), ((0.0, 0.0, 0.09), False), ((0.0, 0.0, 0.11), True)],
+    [
+        ((0.0, 0.4, 0.0, 0.16), False),
+        ((0.0, 0.6, 0.0, 0.0), True),
+        ((0.0, 0.0, 0.09, 0.0), False),
+        ((0.0, 0.0, 0.11, 0.0), True),
+        ((0.0, 0.4, 0.0, 0.17), True),  # 0.51 m at three checkpoints
+        ((0.0, 0.0, 0.0, np.nan), True),
+    ],
 )
 def test_deviations_of_other_objects_and_joints_are_limited(deviation, is_far):
     deviations = [StateDeviation(*deviation)] * 3
     assert bool(list_deviations(make_checkpoints(3), deviations, 20)) == is_far
+
+
+@pytest.mark.parametrize(("joint", "is_far"), [(0.0049, False), (0.024, False), (0.026, True)])
+def test_the_sum_of_the_deviations_of_joints_is_limited(joint, is_far):
+    deviations = [StateDeviation(0.0, 0.0, joint, 0.0)] * 20
+    assert bool(list_deviations(make_checkpoints(20), deviations, 20)) == is_far
 
 
 def make_checkpoints(count):
@@ -145,4 +158,4 @@ def make_checkpoints(count):
 @pytest.mark.parametrize(("steps", "fits"), [([20, 40, 50], True), ([20], True), ([50], False), ([20, 50], False)])
 def test_no_checkpoint_may_be_left_out(steps, fits):
     checkpoints = Checkpoints(np.array(steps, np.int32), np.zeros((len(steps), 4), np.float32))
-    assert (list_deviations(checkpoints, [StateDeviation(0.0, 0.0, 0.0)] * len(steps), 20) == []) == fits
+    assert (list_deviations(checkpoints, [StateDeviation(0.0, 0.0, 0.0, 0.0)] * len(steps), 20) == []) == fits

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from robocas_ms3.evaluation.audit.stored_actions import CheckpointEnv
+from robocas_ms3.evaluation.audit.stored_actions import CheckpointEnv, CheckpointLog
 from robocas_ms3.evaluation.results.checkpoints import StateDeviation, flatten_state, unflatten_state
 from robocas_ms3.evaluation.results.outcomes import Checkpoints
 
-FAR = StateDeviation(0.1, 0.1, 0.1)
+FAR = StateDeviation(0.1, 0.1, 0.1, 0.1)
 
 
 class FakeEnv:
@@ -32,15 +32,16 @@ class FakeEnv:
         return {1: (FAR, ["picked_any"] if self.elapsed == 5 else [])}
 
 
-def run(again: int) -> CheckpointEnv:
+def run(again: int) -> CheckpointLog:
     policy: Any = SimpleNamespace(progress={})
     recorded = Checkpoints(np.array([5, 10, 12], np.int32), np.zeros((3, 4), np.float32))
     result: Any = SimpleNamespace(read_checkpoints=lambda episode: recorded, folder=Path())
-    env = CheckpointEnv(FakeEnv(again), policy, result)
+    log = CheckpointLog()
+    env = CheckpointEnv(FakeEnv(again), policy, result, log)
     for step in range(1, 13):
         policy.progress = {1: (7, step)}
         env.step(None)
-    return env
+    return log
 
 
 def test_a_lost_stage_has_the_step_at_which_it_is_reached_again():

@@ -52,7 +52,7 @@ def test_invalid_backend(monkeypatch, backend, sim_backend, gpu):
         {"env_id": "CartPole-v1"},
         {"num_envs": 0},
         {"num_envs": 2.0},
-        {"workers": 0},
+        {"workers": -1},
         {"arrays": "jax"},
     ],
 )

@@ -57,6 +57,13 @@ def test_env_does_not_depend_on_other_envs(four_envs):
 
 
 @slow
+def test_envs_in_this_process_give_the_same_results(four_envs):
+    with closing(make_short_vec(2, 0)) as env:
+        assert env.unwrapped.pids == ()
+        assert record_episodes(env, 2, 20, HORIZON + 2) == record_episodes(four_envs, 4, 20, HORIZON + 2)[:2]
+
+
+@slow
 def test_env_gives_the_results_of_gym_make(four_envs):
     steps = HORIZON + 2
     seen = record_episodes(four_envs, 4, 20, steps)[3]
