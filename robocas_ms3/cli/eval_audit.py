@@ -132,7 +132,7 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
     count = len(plan.episodes)
     if summary.with_tolerances:
         text = format_count(summary.with_tolerances, "episode")
-        print_line(f"note: {text} diverged and were replayed from checkpoint to checkpoint, with tolerances")
+        print_line(f"note: {text} diverged; replayed from checkpoint to checkpoint, with tolerances")
     earlier = f" ({plan.replayed_before} of them in an earlier run)" if plan.replayed_before else ""
     print_line(
         f"{folder}: {count} of {format_count(total, 'episode')} replayed{earlier}, "
@@ -145,7 +145,7 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
             f"note: {format_count(lacking, 'episode')} failed before the first action, so there is nothing to replay"
         )
     if differing := sum(bool(one.differences) for one in summary.episodes):
-        print_line(f"{differing} of {format_count(count, 'episode')} differ from the result")
+        print_line(f"different from the result: {differing} of {format_count(count, 'episode')}")
         return 1
     print_line("no differences beyond the tolerances" if summary.with_tolerances else "all equal the recorded episodes")
     if count < plan.candidates:
