@@ -26,8 +26,9 @@ RANK_NOTE = (
     "Rank: 1 plus the number of policies of the same track, task, split and camera calibration with significantly "
     "more successes (McNemar's exact test over the same episodes, adjusted by Holm's method), so that ties have equal "
     "ranks. Rows with action noise or weld have no rank. Audited: number of episodes whose stored actions were "
-    "replayed without any difference; +N: N further episodes were replayed within tolerances, on another processor. "
-    "The other episodes have only a hash of their actions: their outcomes are claims of the author."
+    "replayed without any difference; +N: N further episodes were replayed within tolerances, on another processor, "
+    "which finds rough forgeries only. The other episodes have only a hash of their actions: their outcomes are "
+    "claims of the author."
 )
 SUSPICIOUS = 0.001
 """p-value below which a row notes that success differs between episodes with and without stored actions."""
