@@ -27,7 +27,8 @@ from robocas_ms3.evaluation.statistics import compute_success_rate
 
 NOTE = (
     f"Success rates with exact 95 % intervals. {RANK_NOTE} p: adjusted p-value of the comparison with the next ranked "
-    "policy. An audit shows that the stored actions have these outcomes, but not which policy chose them."
+    "policy. An audit shows that the stored actions have these outcomes, but not which policy chose them. Policy, "
+    "track, camera calibration, training data, training and parameters are statements of the author."
 )
 _HEADS = (
     *("policy", "rank#", "success#", "0 to 100 %", "n#", "audited#", "p#", "protocol", "task", "split", "track"),
