@@ -131,7 +131,8 @@ class RoboCASEnv(SceneEnv):
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         mode = self.obs_mode_struct
-        privileged = self.privileged_observations() if mode.state or mode.state_dict else {}
+        is_privileged = self.observes_privileged_state and (mode.state or mode.state_dict)
+        privileged = self.privileged_observations() if is_privileged else {}
         return {**privileged, "tcp_pose": as_tensor(self.tcp_in_world())}
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:

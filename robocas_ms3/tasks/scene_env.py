@@ -73,12 +73,14 @@ class SceneEnv(BaseEnv):
         basket_start_poses: (N, 7) world poses of the basket at the start of the episode.
         camera_shifts: (N, C, 4, 4) random motions of the cameras in their frames (SAPIEN: x forward, y left, z up).
         observes_images: whether observations have images and camera parameters; `render_images` works without.
+        observes_privileged_state: whether observations in a state mode have the privileged observations.
     """
 
     SPEC: ClassVar[TaskSpec]
 
     agent: MobileManipulator
     observes_images = True
+    observes_privileged_state = True
 
     def __init__(
         self,

@@ -67,7 +67,7 @@ class PolicyActionWrapper(gym.Wrapper):
         self._records_checkpoints = checkpoints
         self._convention, self._reference, self._stepping = CONVENTIONS[spec.convention], spec.reference, stepping
         self._base: Any = env.unwrapped
-        self._base.observes_images = False
+        self._base.observes_images, self._base.observes_privileged_state = False, spec.state
         count = self._base.num_envs
         bound = np.full(self._convention.size, np.inf, np.float32)
         self.single_action_space = gym.spaces.Box(-bound, bound)

@@ -72,25 +72,36 @@ def test_a_checkpoint_has_the_state_and_the_gripper_command():
     assert (env.get_info()["checkpoint"][0] == checkpoint).all()  # nothing was simulated
 
 
+@pytest.mark.parametrize("observed", [False, True])
+def test_privileged_state_is_only_computed_for_policies_that_observe_it(observed):
+    env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas", state=observed, track="privileged"), "timed")
+    obs, _ = env.reset(seed=3)
+    assert ("object_poses" in obs["extra"]) == observed
+    assert (set(obs["extra"]) == {"tcp_pose"}) == (not observed)
+
+
 def test_poses_and_joints_return_to_a_checkpoint_but_velocities_do_not():
     env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas"), "timed", checkpoints=True)
     env.reset(seed=3)
     *_, info = env.step(along(0.02))
     checkpoint, base = info["checkpoint"][0].numpy(), env.unwrapped
     bodies = base.bodies.read().shape[1]
-    assert env.restore_checkpoint(checkpoint, 0.0) == ((0, 0, 0), [])
+    assert env.restore_checkpoint(checkpoint, 0.0) == ((0, 0, 0, 0), [])
     for _ in range(3):
         env.step(along(0.02))
-    target = base.objects[int(base.target_slot[0])]
-    pose = target.pose.raw_pose.clone()
-    pose[:, 1] += 0.03
-    target.set_pose(Pose.create(pose))
+    slot = int(base.target_slot[0])
+    target, other, near = (base.objects[(slot + i) % int(base.present[0].sum())] for i in range(3))
+    for body, shift in ((target, 0.03), (other, 0.02), (near, 0.008)):
+        pose = body.pose.raw_pose.clone()
+        pose[:, 1] += shift
+        body.set_pose(Pose.create(pose))
     before = base.bodies.read()[0].numpy().copy()
     forged = checkpoint.copy()
     first = base.bodies.actors.index(target.name) * 13
     forged[first + 7 : first + 13] = 9.0  # a velocity
     deviation, _ = env.restore_checkpoint(forged, np.inf)
     assert deviation.target == deviation.body == pytest.approx(0.03, abs=1e-3)
+    assert deviation.moved == pytest.approx(0.02, abs=1e-3)  # neither the target nor small distances
     turned = np.abs(base.agent.robot.qpos[0].numpy() - qpos_in(base, checkpoint)).max()
     assert deviation.joint == pytest.approx(turned) and turned > 0.02
     assert (base.bodies.read()[0].numpy() == before).all()  # only measured
