@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from robocas_ms3.evaluation.audit.replay import AuditedEpisode
-    from robocas_ms3.evaluation.audit.run import AuditPlan, AuditSummary
+    from robocas_ms3.evaluation.audit.run import AuditPlan, AuditSettings, AuditSummary
     from robocas_ms3.evaluation.protocols.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results.result_files import Result
 
@@ -24,24 +24,44 @@ if TYPE_CHECKING:
 class ReplayOptions:
     """Options of commands that replay stored actions."""
 
+    jobs: Jobs = CORES
+    """Number of processes; 0: replay in this process, without limits of time and memory."""
+
+    def make_settings(
+        self, stored_episodes: Collection[int] | None = None, *, overwrite: bool = False
+    ) -> AuditSettings:
+        """Return the settings of an audit; raise an error if a number is too small."""
+        from robocas_ms3.core.checks import check_number
+        from robocas_ms3.evaluation.audit.run import AuditSettings
+
+        check_number("--jobs", self.jobs, 0)
+        return AuditSettings(stored_episodes=stored_episodes, jobs=self.jobs, overwrite=overwrite)
+
+
+@dataclass(kw_only=True)
+class SampleOptions(ReplayOptions):
+    """Options of commands that may replay a part of the stored actions."""
+
     sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Replay N episodes per result, chosen at random. Default: all with stored actions."""
     seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Random seed of --sample. Default: a random number, which is printed."""
-    jobs: Jobs = CORES
-    """Number of processes; 0: replay in this process, without limits of time and memory."""
 
-    def check(self) -> None:
-        """Raise an error if a number is too small."""
+    def make_settings(
+        self, stored_episodes: Collection[int] | None = None, *, overwrite: bool = False
+    ) -> AuditSettings:
+        """Return the settings of an audit; raise an error if a number is too small."""
         from robocas_ms3.core.checks import check_number
 
-        for name, least in (("sample", 1), ("jobs", 0), ("seed", 0)):
-            if (number := getattr(self, name)) is not None:
-                check_number(f"--{name}", number, least)
+        for name, number, least in (("--sample", self.sample, 1), ("--seed", self.seed, 0)):
+            if number is not None:
+                check_number(name, number, least)
+        settings = super().make_settings(stored_episodes, overwrite=overwrite)
+        return replace(settings, sample=self.sample, seed=self.seed)
 
 
 @dataclass
-class Audit(ReplayOptions):
+class Audit(SampleOptions):
     """Replay the stored actions of a result, and compare the outcomes (exit status 1 if one differs).
 
     The result is first checked like in `robocas eval verify`, but it may lack episodes. Neither the policy nor a
@@ -69,7 +89,7 @@ def audit(cfg: Audit) -> int:
     from robocas_ms3.evaluation.results.result_files import load_protocol_of, read_result
     from robocas_ms3.evaluation.results.verify import find_violations
 
-    cfg.check()
+    settings = cfg.make_settings(overwrite=cfg.overwrite)
     result = read_result(cfg.folder)
     protocol = load_protocol_of(result, cfg.protocol)
     if violations := find_violations(result, protocol, is_complete=False):
@@ -82,25 +102,17 @@ def audit(cfg: Audit) -> int:
     folder, here = cfg.folder.resolve(), Path.cwd().resolve()
     name = folder.relative_to(here) if folder.is_relative_to(here) else folder.name
     out = cfg.out or Path("audit") / name
-    summary = replay_result(result, protocol, out, cfg, overwrite=cfg.overwrite)
+    summary = replay_result(result, protocol, out, settings)
     return _print_summary(cfg.folder, result, protocol, summary)
 
 
-def replay_result(
-    result: Result,
-    protocol: LoadedProtocol,
-    out: Path,
-    options: ReplayOptions,
-    *,
-    stored: Collection[int] | None = None,
-    overwrite: bool = False,
-) -> AuditSummary:
+def replay_result(result: Result, protocol: LoadedProtocol, out: Path, settings: AuditSettings) -> AuditSummary:
     """Replay episodes of a result with a progress bar; print notes and differences (`run_audit`)."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.source_hash import hash_source
     from robocas_ms3.evaluation.audit.obstacles import list_other_processors
-    from robocas_ms3.evaluation.audit.run import AuditSettings, AuditSummary, run_audit
+    from robocas_ms3.evaluation.audit.run import AuditSummary, run_audit
 
     if models := list_other_processors(result):
         print_line(f"note: made on another model of processor, so contacts may diverge: {', '.join(models)}")
@@ -112,16 +124,22 @@ def replay_result(
 
         def start(plan: AuditPlan) -> None:
             plans.append(plan)
-            bar.start(len(plan.episodes))
+            if plan.replayed_before < len(plan.episodes):
+                bar.start(len(plan.episodes), plan.replayed_before)
 
-        settings = AuditSettings(options.sample, options.seed, stored, options.jobs, overwrite)
         for one in run_audit(result, protocol, out, settings, start):
-            bar.advance()
             episodes.append(one)
+            if len(episodes) > plans[0].replayed_before:
+                bar.advance()
     summary = AuditSummary(plans[0], episodes)
     for difference in summary.differences:
         print_line(f"{result.folder}: {difference}")
     return summary
+
+
+def describe_earlier_replays(plan: AuditPlan) -> str:
+    """Return how many episodes were replayed in an earlier run, in parentheses; empty if none."""
+    return f" ({plan.replayed_before} of them in an earlier run)" if plan.replayed_before else ""
 
 
 def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summary: AuditSummary) -> int:
@@ -133,9 +151,8 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, summa
     if summary.with_tolerances:
         text = format_count(summary.with_tolerances, "episode")
         print_line(f"note: {text} diverged; replayed from checkpoint to checkpoint, with tolerances")
-    earlier = f" ({plan.replayed_before} of them in an earlier run)" if plan.replayed_before else ""
     print_line(
-        f"{folder}: {count} of {format_count(total, 'episode')} replayed{earlier}, "
+        f"{folder}: {count} of {format_count(total, 'episode')} replayed{describe_earlier_replays(plan)}, "
         f"of {len(protocol.episodes)} in the protocol"
     )
     if failed := result.count_errors():

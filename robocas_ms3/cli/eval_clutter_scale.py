@@ -74,7 +74,9 @@ def clutter_scale(cfg: PlacePolicies) -> int:
         if task.mean_auc is not None and not study.is_fixed:
             print_line(f"{name}: mean AUC in scenes that were not used for the fit: {task.mean_auc:.2f}")
     for name, counts in study.left_out.items():
-        reason = "the protocol has none" if study.is_fixed else "too few policies have 10 to 90 % success"
+        reason = (
+            "the protocol has none (--fit fits one)" if study.is_fixed else "too few policies have 10 to 90 % success"
+        )
         print_line(f"{name}: no scale, because {reason}: {describe_counts(counts)}")
     print_line(
         "difficulty: 0 is the easiest scene of the protocol, 10 the hardest; none: success does not fall with the "

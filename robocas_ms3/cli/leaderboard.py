@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.cli.eval_audit import ReplayOptions, replay_result
+from robocas_ms3.cli.eval_audit import ReplayOptions, SampleOptions, describe_earlier_replays, replay_result
 from robocas_ms3.cli.options import Folders, Maybe, resumable
 from robocas_ms3.core.text import format_count
 
@@ -39,7 +39,7 @@ class Add:
 
 
 @dataclass
-class AuditEntries(ReplayOptions):
+class AuditEntries(SampleOptions):
     """Check entries, and replay their stored actions (exit status 1 if an outcome differs).
 
     Example: robocas leaderboard audit leaderboard/mine --sample 5
@@ -93,7 +93,7 @@ def audit(cfg: AuditEntries) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.leaderboard.entries import find_results
 
-    cfg.check()
+    cfg.make_settings()  # raises an error if a number is too small
     folders = list(dict.fromkeys(folder for entry in cfg.entries for folder in find_results(entry)))
     with tempfile.TemporaryDirectory() as cache:
         audited = _audit_results(folders, Path(cache), cfg)
@@ -111,7 +111,7 @@ def build(cfg: Build) -> int:
     from robocas_ms3.evaluation.leaderboard.entries import find_results, get_entry_name
     from robocas_ms3.evaluation.leaderboard.output import write_leaderboard_page
 
-    cfg.check()
+    cfg.make_settings()  # raises an error if a number is too small
     check_number("--videos", cfg.videos, 0)
     if cfg.out.exists() and not cfg.out.is_dir():
         raise OutputExistsError("the output is not a folder", where=cfg.out, fix="Choose another path.")
@@ -124,7 +124,8 @@ def build(cfg: Build) -> int:
     if bad:
         print_line(f"{len(bad)} of {format_count(len(folders), 'result')} with problems: {', '.join(bad)}")
         if not (cfg.skip_errors and results):
-            print_line("nothing was written" if cfg.skip_errors else "nothing was written; see --skip-errors")
+            hint = "no result is without problems" if cfg.skip_errors else "see --skip-errors"
+            print_line(f"nothing was written: {hint}")
             return 1
     if cfg.videos:
         for one in results:
@@ -168,7 +169,7 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
             print_line(f"{folder}: {problem}")
         if problems:
             return None
-        summary = replay_result(result, protocol, cache / hash_audit(result), cfg, stored=stored)
+        summary = replay_result(result, protocol, cache / hash_audit(result), cfg.make_settings(stored))
     except RobocasError as error:  # the other results are checked all the same
         print_line(f"{folder}: {error}")
         return None
@@ -176,8 +177,9 @@ def _audit_result(folder: Path, cache: Path, cfg: AuditEntries | Build) -> Audit
         return None
     count, diverged = len(summary.episodes), summary.with_tolerances
     mode = f", {diverged} within the tolerances from checkpoint to checkpoint" if diverged else ""
-    sample = "" if cfg.sample is None else f" (sample with seed {summary.plan.seed})"
-    print_line(f"{folder}: {format_count(count, 'episode')} replayed{sample}: {count - diverged} equal{mode}")
+    earlier = describe_earlier_replays(summary.plan)
+    sample = f", a sample with seed {summary.plan.seed}" if count < summary.plan.candidates else ""
+    print_line(f"{folder}: {format_count(count, 'episode')} replayed{earlier}{sample}: {count - diverged} equal{mode}")
     return AuditedResult(result, protocol, summary.modes)
 
 

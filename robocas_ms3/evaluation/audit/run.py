@@ -101,6 +101,8 @@ def run_audit(
 ) -> Iterator[AuditedEpisode]:
     """Replay episodes of a result and yield each. An interrupted audit is continued.
 
+    Episodes in which an earlier audit found differences are always among them.
+
     Args:
         result: the result, without violations (`verify`).
         protocol: its protocol.
@@ -120,7 +122,8 @@ def run_audit(
         output.start({**record, "seed": seed})
         file, stored = JsonLinesFile[AuditedEpisode](output.path / _EPISODES, AuditedEpisode), settings.stored_episodes
         replayed = {one.episode: one for one in file.read()}
-        chosen = choose_episodes(result, settings.sample, seed, stored)
+        known = {number for number, one in replayed.items() if one.differences}  # a difference is never forgotten
+        chosen = sorted({*choose_episodes(result, settings.sample, seed, stored), *known})
         candidates = len(choose_episodes(result, stored=stored))
         on_start(AuditPlan(chosen, seed, candidates, len(replayed.keys() & set(chosen))))
         yield from (replayed[number] for number in chosen if number in replayed)

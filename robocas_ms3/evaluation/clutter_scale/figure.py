@@ -17,7 +17,7 @@ _DASHED = "privileged"  # track whose curves are dashed
 def write_curves(study: ClutterStudy, path: Path) -> None:
     """Write the curves of all policies, and the number of scenes by difficulty, as PNG; one column per task."""
     columns = len(study.tasks)
-    figure = make_figure(1.5 + 5 * columns, 5.5)
+    figure = make_figure(max(9, 1.5 + 5 * columns), 5.5)
     axes = make_axes(figure, 2, columns, 2 * columns)
     figure.get_layout_engine().set(h_pad=0.1)
     names = dict.fromkeys(policy.name for task in study.tasks.values() for policy in task.policies)
@@ -36,7 +36,8 @@ def write_curves(study: ClutterStudy, path: Path) -> None:
         curves.set(title=name, ylabel="success / %", ylim=(-2, 102), xlim=(0, HARDEST))
         scenes.hist(task.difficulty, bins=20, range=(0, HARDEST))
         scenes.set(xlabel="difficulty", ylabel="scenes", xlim=(0, HARDEST))
-    figure.suptitle("Success against difficulty (dots: half of the episodes succeed; dashed: privileged)", fontsize=10)
+    title = "Success against difficulty (dots: half of the episodes succeed; bars: 95 % intervals; dashed: privileged)"
+    figure.suptitle(title, fontsize=10)
     figure.legend(lines.values(), lines, fontsize=7, loc="outside lower center", ncols=2)
     with atomic_file(path) as tmp:
         figure.savefig(tmp, dpi=DPI, format="png")

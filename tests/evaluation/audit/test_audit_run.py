@@ -204,6 +204,13 @@ def test_a_sample_is_repeatable_and_leaves_out_episodes_with_errors(folder):
     assert replay(folder, "drawn", sample=2) == drawn  # an audit that is continued keeps its sample
 
 
+def test_a_difference_of_an_earlier_audit_is_not_forgotten_by_another_sample(folder):
+    forge_longer_path(folder, read_result(folder).outcomes[0])
+    assert replay(folder)[1] == [0]
+    seed = next(seed for seed in range(99) if choose_episodes(read_result(folder), 1, seed) == [2])
+    assert replay(folder, sample=1, seed=seed) == ([0, 2], [0])
+
+
 def test_episodes_with_errors_are_replayed_up_to_the_error(folder, tmp_path, capsys):
     lost = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "error"}
     one = read_result(folder).outcomes[0]
