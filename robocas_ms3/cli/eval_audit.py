@@ -25,7 +25,7 @@ class ReplayOptions:
     """Options of commands that replay stored actions."""
 
     jobs: Jobs = CORES
-    """Number of processes; 0: replay in this process, without limits of time and memory."""
+    """Number of processes. Default: one per CPU core. 0: replay in this process, without limits of time and memory."""
 
     def make_settings(
         self, stored_episodes: Collection[int] | None = None, *, overwrite: bool = False
